@@ -1,0 +1,84 @@
+import warnings
+
+import pytest
+import torch
+
+from torchmeso.backends import opencl
+from torchmeso.errors import BackendError
+
+
+@pytest.fixture
+def no_platform(monkeypatch):
+    def fail():
+        raise BackendError("opencl: expected at least one platform, got none")
+
+    caches = (opencl.queue, opencl.kernel, opencl._program, opencl._warn_once)
+    monkeypatch.setattr(opencl, "_pyopencl", fail)
+    for cache in caches:
+        cache.cache_clear()
+    yield
+    for cache in caches:
+        cache.cache_clear()
+
+
+def test_self_test_is_exact(device):
+    assert opencl.self_test() == 0.0
+
+
+def test_exactly_one_device_is_chosen(device):
+    assert sum(d.chosen for d in opencl.list_devices()) == 1
+
+
+def test_newest_pocl_wins_whatever_the_order():
+    class Platform:
+        def __init__(self, name, version):
+            self.name, self.version = name, version
+
+    old = Platform("Portable Computing Language", "OpenCL 3.0 PoCL 3.0-rc2  Linux")
+    new = Platform("Portable Computing Language", "OpenCL 3.0 PoCL 10.1+debian  Linux")
+    other = Platform("Some OpenCL", "OpenCL 3.0 LINUX")
+    assert opencl._choose([other, old, new]) is new
+    assert opencl._choose([new, old, other]) is new
+    assert opencl._choose([other]) is other
+
+
+def test_environment_chooses_by_name(monkeypatch):
+    class Platform:
+        name, version = "Portable Computing Language", "OpenCL 3.0 PoCL 3.0-rc2"
+
+    monkeypatch.setenv("TORCHMESO_OPENCL", "pocl 3.0")
+    assert opencl._choose([Platform]) is Platform
+    monkeypatch.setenv("TORCHMESO_OPENCL", "intel")
+    with pytest.raises(BackendError, match="no platform contains 'intel'; installed: Portable"):
+        opencl._choose([Platform])
+
+
+def test_auto_falls_back_to_torch_with_one_warning(no_platform):
+    with pytest.warns(UserWarning, match="got none; running on the torch backend"):
+        assert opencl.resolve("auto") == "torch"
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert opencl.resolve("auto") == "torch"
+    assert opencl.list_devices() == []
+
+
+def test_explicit_choice_is_kept(no_platform):
+    assert opencl.resolve("opencl") == "opencl"
+    assert opencl.resolve("torch") == "torch"
+
+
+@pytest.mark.errors
+def test_buffers_refuse_gradients_and_views(device):
+    with pytest.raises(BackendError, match="no gradient on opencl"):
+        opencl.buffer(torch.zeros(4, requires_grad=True))
+    with pytest.raises(BackendError, match="contiguous tensor aligned to 64 bytes"):
+        opencl.buffer(torch.zeros(64)[1:])
+
+
+def test_build_failure_carries_the_log(device, tmp_path, monkeypatch):
+    (tmp_path / "broken.cl").write_text("__kernel void broken() { nonsense; }")
+    monkeypatch.setattr(opencl, "KERNELS", tmp_path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with pytest.raises(BackendError, match=r"(?s)kernels_cl/broken\.cl did not build:.*nonsense"):
+            opencl.kernel("broken.cl", "broken")

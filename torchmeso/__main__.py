@@ -1,0 +1,5 @@
+"""`python -m torchmeso`: the command line."""
+
+from torchmeso.cli import main
+
+main()

@@ -1,0 +1,190 @@
+"""OpenCL: the choice of a device, one queue per process, kernels built once per (file, name).
+
+The only module that imports pyopencl. PoCL runs kernels on the CPU; where several platforms are installed
+the newest PoCL is taken by its version string, never by index, because the order differs between machines.
+TORCHMESO_OPENCL names another: a piece of the platform's name or version.
+
+Kernels: kernels_cl/backends/opencl.cl (a self-test)          Test: tests/backends/test_opencl.py
+"""
+
+import os
+import re
+import warnings
+from dataclasses import dataclass
+from functools import cache, lru_cache
+from importlib.resources import files
+from types import ModuleType
+from typing import TYPE_CHECKING, Literal
+
+import torch
+from torch import Tensor
+
+from torchmeso.backends import BackendChoice
+from torchmeso.errors import BackendError
+
+if TYPE_CHECKING:
+    import pyopencl as cl
+
+# Pinning PoCL's threads removes a bimodal 1x / 2x in kernels of about a millisecond; read at the first OpenCL call.
+os.environ.setdefault("POCL_AFFINITY", "1")
+
+KERNELS = files("kernels_cl")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DeviceInfo:
+    """What `torchmeso info --device` prints of one OpenCL device.
+
+    Attributes:
+        platform: the platform's name.
+        version: the platform's version string, which tells two PoCLs apart.
+        device: the device's name.
+        compute_units: hardware threads.
+        global_bytes: memory of the device.
+        chosen: whether kernels run here.
+    """
+
+    platform: str
+    version: str
+    device: str
+    compute_units: int
+    global_bytes: int
+    chosen: bool
+
+
+def list_devices() -> list[DeviceInfo]:
+    """Return every OpenCL device of this machine; empty where no platform is installed."""
+    try:
+        platforms = _pyopencl().get_platforms()
+    except BackendError:
+        return []
+    chosen = _choose(platforms)
+    return [
+        DeviceInfo(
+            platform=platform.name.strip(),
+            version=platform.version.strip(),
+            device=device.name.strip(),
+            compute_units=device.max_compute_units,
+            global_bytes=device.global_mem_size,
+            chosen=platform == chosen and i == 0,
+        )
+        for platform in platforms
+        for i, device in enumerate(platform.get_devices())
+    ]
+
+
+def resolve(choice: BackendChoice) -> Literal["torch", "opencl"]:
+    """Return the backend behind `auto`: opencl where a device works, else torch with one warning."""
+    if choice != "auto":
+        return choice
+    try:
+        queue()
+    except BackendError as error:
+        _warn_once(str(error))
+        return "torch"
+    return "opencl"
+
+
+@lru_cache(maxsize=1)
+def queue() -> "cl.CommandQueue":
+    """Return the queue on the chosen device.
+
+    Raises:
+        BackendError: no platform is installed, or none matches TORCHMESO_OPENCL.
+    """
+    cl = _pyopencl()
+    device = _choose(cl.get_platforms()).get_devices()[0]
+    return cl.CommandQueue(cl.Context([device]))
+
+
+@cache
+def kernel(path: str, name: str, options: tuple[str, ...] = ()) -> "cl.Kernel":
+    """Build `kernels_cl/<path>` with `options` and return the kernel `name`.
+
+    Raises:
+        BackendError: no device, or the build failed; the text carries the compiler's log.
+    """
+    cl = _pyopencl()
+    return cl.Kernel(_program(path, options), name)
+
+
+@cache
+def _program(path: str, options: tuple[str, ...]) -> "cl.Program":
+    cl = _pyopencl()
+    source = (KERNELS / path).read_text()
+    try:
+        program = cl.Program(queue().context, source)
+        return program.build(["-I", str(KERNELS), "-cl-std=CL1.2", *options])
+    except cl.Error as error:
+        raise BackendError(f"kernels_cl/{path} did not build:\n{error}") from error
+
+
+def buffer(x: Tensor) -> "cl.Buffer":
+    """Return an OpenCL buffer over the memory of `x`: no copy, so keep both alive while a kernel may run.
+
+    Raises:
+        BackendError: `x` is a view that is not contiguous, is not 64-byte aligned, or wants a gradient.
+    """
+    cl = _pyopencl()
+    if x.requires_grad:
+        raise BackendError("buffer: no gradient on opencl; use backend='torch' or detach() the inputs")
+    if not x.is_contiguous() or x.data_ptr() % 64:
+        raise BackendError("buffer: expected a contiguous tensor aligned to 64 bytes; call clone() first")
+    flags = cl.mem_flags.READ_WRITE | cl.mem_flags.USE_HOST_PTR
+    return cl.Buffer(queue().context, flags, hostbuf=x.numpy())
+
+
+def self_test() -> float:
+    """Run a small kernel on the chosen device and return its largest error against torch (0 when sound).
+
+    Raises:
+        BackendError: no device, or the kernel did not build.
+    """
+    cl = _pyopencl()
+    x = torch.linspace(-2, 2, 1024).reshape(64, 16)
+    y = torch.empty_like(x)
+    device_x, device_y = buffer(x), buffer(y)
+    kernel("backends/opencl.cl", "self_test")(queue(), (64,), (8,), device_x, device_y)
+    queue().finish()
+    mapped, _ = cl.enqueue_map_buffer(queue(), device_y, cl.map_flags.READ, 0, tuple(y.shape), "float32")
+    error = (torch.from_numpy(mapped.copy()) - (2 * x + 1)).abs().max().item()
+    mapped.base.release(queue())
+    return error
+
+
+def _pyopencl() -> ModuleType:
+    """Import pyopencl, or say how to get it."""
+    try:
+        import pyopencl
+    except ImportError as error:
+        raise BackendError("opencl: pyopencl is not installed; pip install 'pyopencl[pocl]', or use torch") from error
+    try:
+        pyopencl.get_platforms()
+    except pyopencl.LogicError as error:
+        raise BackendError(
+            "opencl: expected at least one platform, got none; pip install 'pyopencl[pocl]', or use the torch backend"
+        ) from error
+    return pyopencl
+
+
+def _choose(platforms: list) -> "cl.Platform":
+    """Return the platform TORCHMESO_OPENCL asks for, else the newest PoCL, else the first."""
+    wanted = os.environ.get("TORCHMESO_OPENCL")
+    if wanted:
+        for platform in platforms:
+            if wanted.lower() in f"{platform.name} {platform.version}".lower():
+                return platform
+        have = "; ".join(f"{p.name} {p.version}" for p in platforms)
+        raise BackendError(f"TORCHMESO_OPENCL: no platform contains '{wanted}'; installed: {have}")
+    pocl = [p for p in platforms if "pocl" in p.version.lower()]
+    return max(pocl, key=lambda p: _pocl_version(p.version)) if pocl else platforms[0]
+
+
+def _pocl_version(version: str) -> tuple[int, ...]:
+    found = re.search(r"pocl\s+(\d+)\.(\d+)", version, re.IGNORECASE)
+    return tuple(int(n) for n in found.groups()) if found else (0, 0)
+
+
+@lru_cache(maxsize=1)
+def _warn_once(text: str) -> None:
+    warnings.warn(f"{text}; running on the torch backend", stacklevel=3)

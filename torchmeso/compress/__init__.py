@@ -1,0 +1,1 @@
+"""fit(...) -> a run-time container."""

@@ -1,0 +1,1 @@
+"""Containers, each with its files."""

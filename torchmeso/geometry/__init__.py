@@ -1,0 +1,1 @@
+"""Directions, frames, cameras, lights, meshes and rays."""

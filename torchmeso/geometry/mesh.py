@@ -1,0 +1,314 @@
+"""Triangle meshes dressed for a mesostructure: texture coordinates, tangent frames, texture scale, components.
+
+`dress` makes a Mesh from raw arrays; `load` reads a file through trimesh and dresses it. Vertices are split
+where texture coordinates jump, where a crease is sharper than `CREASE_DEG`, and where the handedness of the
+texture changes; split vertices share their position bit for bit, so shared edges are still drawn once.
+
+Test: tests/geometry/test_mesh.py
+"""
+
+import math
+import warnings
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchmeso.errors import FormatError, GeometryError, check_shape
+from torchmeso.geometry import components
+from torchmeso.geometry.directions import dot, normalize
+
+CREASE_DEG = 60.0
+"""Faces that meet at a sharper angle (degrees between normals) do not share a vertex normal."""
+
+ANISOTROPY_WARNING = 2.0
+"""Mean ratio of the singular values of the texture map above which `load` and `dress` warn."""
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Mesh:
+    """A mesh ready to be dressed; every per-vertex array has the same length V.
+
+    Attributes:
+        vertices: (V, 3) world positions.
+        faces: (F, 3) vertex numbers, counter-clockwise seen from outside.
+        uv: (V, 2) texture coordinates in tiles, unbounded, v up.
+        normals: (V, 3) unit, outwards.
+        tangents: (V, 3) unit, perpendicular to the normal, along +u.
+        sign: (V,) +1, or -1 where the texture is mirrored: b = sign (n x t).
+        scale: (V,) texture scale s: world length of one tile, sqrt(world area / UV area).
+        component: (F,) connected component of each face.
+        closed: (C,) whether a component is closed: only these have silhouettes.
+    """
+
+    vertices: Float[Tensor, "V 3"]
+    faces: Int[Tensor, "F 3"]
+    uv: Float[Tensor, "V 2"]
+    normals: Float[Tensor, "V 3"]
+    tangents: Float[Tensor, "V 3"]
+    sign: Float[Tensor, "V"]
+    scale: Float[Tensor, "V"]
+    component: Int[Tensor, "F"]
+    closed: Bool[Tensor, "C"]
+
+    def __post_init__(self) -> None:
+        """Raise ShapeError unless the arrays match."""
+        n = len(self.vertices)
+        check_shape("mesh.vertices", self.vertices, (n, 3))
+        check_shape("mesh.faces", self.faces, (-1, 3))
+        check_shape("mesh.uv", self.uv, (n, 2))
+        for name in ("normals", "tangents"):
+            check_shape(f"mesh.{name}", getattr(self, name), (n, 3))
+        for name in ("sign", "scale"):
+            check_shape(f"mesh.{name}", getattr(self, name), (n,))
+        check_shape("mesh.component", self.component, (len(self.faces),))
+
+
+def load(path: str | Path) -> Mesh:
+    """Return the mesh of a file that trimesh reads (OBJ, PLY, GLB, OFF, STL), dressed.
+
+    Raises:
+        FormatError: the file is missing or unreadable.
+        GeometryError: it has no triangles, or no texture coordinates (`unwrap.unwrap` makes some).
+    """
+    vertices, faces, uv = read_arrays(path)
+    if uv is None:
+        raise GeometryError(
+            f"{Path(path).name}: expected texture coordinates, got none; "
+            "make some with `unwrap: true` in the configuration (or torchmeso.geometry.unwrap), which cuts seams"
+        )
+    return dress(vertices, faces, uv, name=Path(path).name)
+
+
+def read_arrays(path: str | Path) -> tuple[Float[Tensor, "V 3"], Int[Tensor, "F 3"], Float[Tensor, "V 2"] | None]:
+    """Return vertices, faces and texture coordinates (None where the file has none) of a mesh file.
+
+    Raises:
+        FormatError: the file is missing or unreadable.
+        GeometryError: it holds no triangles, or coordinates that are not finite.
+    """
+    import trimesh
+
+    path = Path(path)
+    if not path.is_file():
+        raise FormatError(f"{path}: expected a mesh file, found none; check the path")
+    try:
+        loaded = trimesh.load(path, process=False)
+    except Exception as error:  # trimesh raises whatever its many readers raise
+        raise FormatError(f"{path}: trimesh could not read it ({type(error).__name__}: {error})") from error
+    parts = list(loaded.dump()) if isinstance(loaded, trimesh.Scene) else [loaded]
+    parts = [part for part in parts if isinstance(part, trimesh.Trimesh) and len(part.faces)]
+    if not parts:
+        raise GeometryError(f"{path.name}: expected triangles, got none")
+    uvs = [getattr(part.visual, "uv", None) for part in parts]
+    first = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    vertices = torch.from_numpy(np.concatenate([part.vertices for part in parts]).astype(np.float32))
+    faces = torch.from_numpy(
+        np.concatenate([part.faces + n for part, n in zip(parts, first[:-1], strict=True)]).astype(np.int64)
+    )
+    if not torch.isfinite(vertices).all():
+        raise GeometryError(f"{path.name}: expected finite vertex positions, got NaN or infinity")
+    if any(uv is None or len(uv) == 0 for uv in uvs):
+        return vertices, faces, None
+    return vertices, faces, torch.from_numpy(np.concatenate(uvs).astype(np.float32))
+
+
+def dress(
+    vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], uv: Float[Tensor, "V 2"], *, name: str = "mesh"
+) -> Mesh:
+    """Return a Mesh: orientation mended, normals, tangents, texture scale and components found.
+
+    Closed components that face inwards are turned around (with a warning), cavities stay.
+
+    Args:
+        vertices: (V, 3) world positions; equal positions are one point of the surface.
+        faces: (F, 3) vertex numbers; faces without area stay but take no part in the frames.
+        uv: (V, 2) in tiles.
+        name: what warnings and errors call the mesh.
+
+    Raises:
+        GeometryError: no face has both world and texture area, or a value is not finite.
+    """
+    if not (torch.isfinite(vertices).all() and torch.isfinite(uv).all()):
+        raise GeometryError(f"{name}: expected finite positions and texture coordinates, got NaN or infinity")
+    found = components.find(vertices, faces)
+    flip = components.inside_out(found, vertices, faces)[found.of_face]
+    if bool(flip.any()):
+        warnings.warn(f"{name}: {int(flip.sum())} faces of closed parts looked inwards and were turned", stacklevel=2)
+        faces = torch.where(flip[:, None], faces.flip(1), faces)
+    jacobian = _uv_jacobian(vertices, faces, uv)
+    usable = (jacobian.area > 0) & (jacobian.uv_area.abs() > 0)
+    if not bool(usable.any()):
+        raise GeometryError(f"{name}: expected at least one triangle with world and texture area, got none")
+    _warn_about_anisotropy(name, jacobian, usable)
+
+    position = components.weld(vertices)
+    corner_normal = _corner_normals(vertices, faces, position)
+    handed = torch.where(jacobian.uv_area < 0, -1.0, 1.0)
+    split = _split(faces, corner_normal, handed)
+    source = split.source
+    normals = corner_normal.reshape(-1, 3)[split.corner]
+    group = torch.unique(torch.cat([position[source, None].double(), normals.double()], 1), dim=0, return_inverse=True)
+    scale = _texture_scale(jacobian, usable, split.faces, group[1])
+    sign = handed[split.corner // 3]
+    tangents = _tangents(jacobian, usable, split.faces, normals, 2 * group[1] + (sign < 0))
+    return Mesh(
+        vertices=vertices[source],
+        faces=split.faces,
+        uv=uv[source],
+        normals=normals,
+        tangents=tangents,
+        sign=sign.to(vertices.dtype),
+        scale=scale.to(vertices.dtype),
+        component=found.of_face,
+        closed=found.closed,
+    )
+
+
+def transform(mesh: Mesh, matrix: Float[Tensor, "4 4"]) -> Mesh:
+    """Return `mesh` moved by a similarity (rotation, uniform scale, translation) given as a 4 x 4 matrix.
+
+    Raises:
+        GeometryError: the upper 3 x 3 block is not a rotation times a positive scale.
+    """
+    linear = matrix[:3, :3].double()
+    size = linear.det().abs().pow(1 / 3)
+    rotation = linear / size
+    if linear.det() <= 0 or not torch.allclose(rotation @ rotation.T, torch.eye(3, dtype=torch.float64), atol=1e-5):
+        raise GeometryError("transform: expected rotation, positive uniform scale and translation only")
+    dtype = mesh.vertices.dtype
+    return replace(
+        mesh,
+        vertices=(mesh.vertices.double() @ linear.T + matrix[:3, 3].double()).to(dtype),
+        normals=(mesh.normals.double() @ rotation.T).to(dtype),
+        tangents=(mesh.tangents.double() @ rotation.T).to(dtype),
+        scale=mesh.scale * size.to(dtype),
+    )
+
+
+class _Jacobian(NamedTuple):
+    """Per face, float64: world area, signed UV area, and world derivatives by u and v (times the UV area)."""
+
+    area: Tensor
+    uv_area: Tensor
+    du: Tensor
+    dv: Tensor
+
+
+def _uv_jacobian(vertices: Tensor, faces: Tensor, uv: Tensor) -> _Jacobian:
+    p, q = vertices.double()[faces], uv.double()[faces]
+    e1, e2 = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
+    (u1, v1), (u2, v2) = (q[:, 1] - q[:, 0]).unbind(-1), (q[:, 2] - q[:, 0]).unbind(-1)
+    uv_area = (u1 * v2 - u2 * v1) / 2
+    side = torch.where(uv_area < 0, -1.0, 1.0).unsqueeze(-1)
+    du = side * (v2.unsqueeze(-1) * e1 - v1.unsqueeze(-1) * e2)
+    dv = side * (u1.unsqueeze(-1) * e2 - u2.unsqueeze(-1) * e1)
+    return _Jacobian(torch.linalg.cross(e1, e2).norm(dim=-1) / 2, uv_area, du, dv)
+
+
+def _warn_about_anisotropy(name: str, jacobian: _Jacobian, usable: Tensor) -> None:
+    ratio = _anisotropy(jacobian, usable)
+    if ratio > ANISOTROPY_WARNING:
+        warnings.warn(
+            f"{name}: the texture is stretched by a mean factor of {ratio:.1f} in one direction; "
+            "depths follow the mean scale",
+            stacklevel=3,
+        )
+
+
+def anisotropy(mesh: Mesh) -> float:
+    """Return the area-weighted mean ratio of the singular values of the texture map (1 = no stretch)."""
+    jacobian = _uv_jacobian(mesh.vertices, mesh.faces, mesh.uv)
+    return _anisotropy(jacobian, (jacobian.area > 0) & (jacobian.uv_area != 0))
+
+
+def _anisotropy(jacobian: _Jacobian, usable: Tensor) -> float:
+    du, dv, area = jacobian.du[usable], jacobian.dv[usable], jacobian.area[usable]
+    e, f, g = dot(du, du), dot(du, dv), dot(dv, dv)
+    root = torch.sqrt((e - g).square() + 4 * f.square())
+    ratio = torch.sqrt((e + g + root) / (e + g - root).clamp(min=1e-12 * (e + g)))
+    return float((ratio * area).sum() / area.sum())
+
+
+def _corner_normals(vertices: Tensor, faces: Tensor, position: Tensor) -> Tensor:
+    """Return (F, 3, 3) normals per corner: angle-weighted means over the faces around it up to the crease angle.
+
+    Corners at one position that collect the same faces get the same bits, so that they can share a vertex.
+    """
+    p = vertices.double()[faces]
+    face_normal = normalize(torch.linalg.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]))
+    to_next, to_last = normalize(p.roll(-1, 1) - p), normalize(p.roll(1, 1) - p)
+    angle = torch.acos(dot(to_next, to_last).clamp(-1, 1)).flatten()
+    around = position[faces].flatten()
+    order = torch.argsort(around, stable=True)
+    count = torch.bincount(around)
+    start = count.cumsum(0) - count
+
+    # All pairs of corners at one position: corner i collects the face of corner j.
+    pairs = count[around[order]]
+    i = order.repeat_interleave(pairs)
+    within = torch.arange(len(i)) - (pairs.cumsum(0) - pairs).repeat_interleave(pairs)
+    j = order[start[around[i]] + within]
+    near = dot(face_normal[i // 3], face_normal[j // 3]) >= math.cos(math.radians(CREASE_DEG))
+    weighted = face_normal[j // 3] * (angle[j] * near).unsqueeze(-1)
+    normal = torch.zeros(3 * len(faces), 3, dtype=torch.float64).index_add_(0, i, weighted)
+    lost = normal.norm(dim=-1) < 1e-12  # around faces without area any unit vector will do
+    normal[lost] = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    return normalize(normal).to(vertices.dtype).reshape(-1, 3, 3)
+
+
+class _Split(NamedTuple):
+    faces: Tensor  # (F, 3) new vertex numbers
+    source: Tensor  # (V') old vertex of each new one
+    corner: Tensor  # (V') one corner (3 face + k) that uses it
+
+
+def _split(faces: Tensor, corner_normal: Tensor, handed: Tensor) -> _Split:
+    """Split vertices so that each has one normal and one handedness."""
+    vertex = faces.flatten()[:, None].double()
+    key = torch.cat([vertex, corner_normal.reshape(-1, 3).double(), handed.repeat_interleave(3)[:, None]], 1)
+    unique, number = torch.unique(key, dim=0, return_inverse=True)
+    corner = torch.full((len(unique),), 3 * len(faces), dtype=torch.long)
+    corner.scatter_reduce_(0, number, torch.arange(3 * len(faces)), "amin")
+    return _Split(number.reshape(-1, 3), faces.flatten()[corner], corner)
+
+
+def _texture_scale(jacobian: _Jacobian, usable: Tensor, faces: Tensor, group: Tensor) -> Tensor:
+    """Return s per vertex; vertices at one position with one normal share it, so that shells do not tear."""
+    n_group = int(group.max()) + 1
+    corner_group = group[faces]
+    area = torch.zeros(n_group, dtype=torch.float64)
+    uv_area = torch.zeros_like(area)
+    for k in range(3):
+        area.index_add_(0, corner_group[:, k], jacobian.area * usable)
+        uv_area.index_add_(0, corner_group[:, k], jacobian.uv_area.abs() * usable)
+    mean = math.sqrt(float(jacobian.area[usable].sum() / jacobian.uv_area[usable].abs().sum()))
+    scale = torch.where(uv_area > 0, (area / uv_area.clamp(min=1e-300)).sqrt(), mean)
+    return scale[group]
+
+
+def _tangents(jacobian: _Jacobian, usable: Tensor, faces: Tensor, normals: Tensor, group: Tensor) -> Tensor:
+    """Return unit tangents: the area-weighted mean of dP/du around each vertex, made perpendicular to the normal.
+
+    Across a seam where the texture goes on in the same direction (the two sides of a tiled torus) both sides take
+    their common mean; where the chart turns, each keeps its own.
+    """
+    total = torch.zeros(len(normals), 3, dtype=torch.float64)
+    direction = normalize(jacobian.du) * (jacobian.area * usable).unsqueeze(-1)
+    for k in range(3):
+        total.index_add_(0, faces[:, k], direction)
+    size = int(group.max()) + 1
+    mean = torch.zeros(size, 3, dtype=torch.float64).index_add_(0, group, total)
+    agreement = torch.full((size,), 1.0, dtype=torch.float64)
+    agreement.scatter_reduce_(0, group, dot(normalize(total), normalize(mean)[group]), "amin")
+    total = torch.where((agreement > math.cos(math.radians(30)))[group, None], mean[group], total)
+
+    n = normals.double()
+    flat = total - dot(total, n).unsqueeze(-1) * n
+    axis = torch.nn.functional.one_hot(n.abs().argmin(-1), 3).double()
+    lost = dot(flat, flat) <= 1e-20 * dot(total, total).clamp(min=1e-300)
+    return normalize(torch.where(lost.unsqueeze(-1), torch.linalg.cross(n, axis), flat)).to(normals.dtype)

@@ -1,0 +1,1 @@
+"""A mesostructure in, tables out."""

@@ -1,0 +1,1 @@
+"""Dressed meshes to pictures."""

@@ -1,0 +1,1 @@
+"""Materials and light transport, shared by baking and truth."""
