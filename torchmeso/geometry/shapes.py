@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchmeso.errors import check_range
@@ -151,7 +151,7 @@ def _from_grid(
 
 def _grid(
     point: Callable[[Tensor, Tensor], Tensor], n_a: int, n_b: int, tiles: Tiles, wrap: tuple[bool, bool]
-) -> tuple[Float[Tensor, "V 3"], Float[Tensor, "V 2"], Float[Tensor, "F 3"]]:
+) -> tuple[Float[Tensor, "V 3"], Float[Tensor, "V 2"], Int[Tensor, "F 3"]]:
     """Sample `point` on (n_a + 1) x (n_b + 1) vertices; a wrapped axis ends on its first row, bit for bit.
 
     Quads that touch a pole keep only the triangle that has area.
