@@ -6,10 +6,7 @@ only: where a container is made, where a file is read, and at public operations.
 
 import difflib
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from torch import Tensor
+from typing import Any
 
 
 class MesoError(Exception):
@@ -40,7 +37,7 @@ class BackendError(MesoError, RuntimeError):
     """OpenCL is missing, a kernel did not build, or a backend cannot do what is asked."""
 
 
-def check_shape(name: str, x: "Tensor", expected: Sequence[int]) -> None:
+def check_shape(name: str, x: Any, expected: Sequence[int]) -> None:
     """Raise ShapeError unless `x` has exactly the shape `expected` (-1 matches any size)."""
     fits = len(x.shape) == len(expected) and all(e in (-1, n) for n, e in zip(x.shape, expected, strict=True))
     if not fits:

@@ -19,7 +19,7 @@ def directions(request):
 
 def lookup(directions, table, w):
     found = hemisphere.interpolate(directions, w)
-    return (hemisphere.with_pole(table, directions)[found.index] * found.weight).sum(-1)
+    return (hemisphere.with_pole(table, directions)[found.node] * found.weight).sum(-1)
 
 
 def test_ring_angles_of_the_papers_grid():
@@ -47,8 +47,8 @@ def test_parse_inverts_the_name(directions):
 def test_weights_are_a_partition_of_unity(directions, rng):
     w = normalize(torch.randn(2000, 3, dtype=torch.float64, generator=rng))
     found = hemisphere.interpolate(directions, w)
-    assert found.index.min() >= 0
-    assert found.index.max() < directions.n_nodes
+    assert found.node.min() >= 0
+    assert found.node.max() < directions.n_nodes
     assert found.weight.min() >= 0
     torch.testing.assert_close(found.weight.sum(-1), torch.ones(2000, dtype=torch.float64), **FLOAT64)
 

@@ -82,11 +82,11 @@ class Footprint(NamedTuple):
     """The four nodes around each direction.
 
     Attributes:
-        index: (..., 4) node in [0, n_nodes).
+        node: (..., 4) in [0, n_nodes).
         weight: (..., 4) in [0, 1], sums to 1.
     """
 
-    index: Int[Tensor, "*batch 4"]
+    node: Int[Tensor, "*batch 4"]
     weight: Float[Tensor, "*batch 4"]
 
 
@@ -166,16 +166,16 @@ def interpolate(directions: DirectionSet, w: Float[Tensor, "*batch 3"]) -> Footp
     above = (k + 1).clamp(max=n_ring - 1)
     span = (ring_theta[above] - ring_theta[k]).clamp(min=torch.finfo(w.dtype).tiny)
     outer = ((theta - ring_theta[k]) / span).clamp(0, 1)
-    index, weight = [], []
+    node, weight = [], []
     for ring, share in ((k, 1 - outer), (above, outer)):
-        count = rings.count[ring]
-        x = (phi - rings.phi0[ring].to(w.dtype)) * count.to(w.dtype) / (2 * math.pi)
+        size = rings.size[ring]
+        x = (phi - rings.phi0[ring].to(w.dtype)) * size.to(w.dtype) / (2 * math.pi)
         first = x.detach().floor()
         f = x - first
         j = first.long()
-        index += [rings.offset[ring] + j % count, rings.offset[ring] + (j + 1) % count]
+        node += [rings.offset[ring] + j % size, rings.offset[ring] + (j + 1) % size]
         weight += [share * (1 - f), share * f]
-    return Footprint(torch.stack(index, -1), torch.stack(weight, -1))
+    return Footprint(torch.stack(node, -1), torch.stack(weight, -1))
 
 
 def quadrature(directions: DirectionSet) -> Float[Tensor, "direction"]:
@@ -204,7 +204,7 @@ def quadrature(directions: DirectionSet) -> Float[Tensor, "direction"]:
 
 class _Rings(NamedTuple):
     theta: Tensor  # (ring) radians, the pole first
-    count: Tensor  # (ring)
+    size: Tensor  # (ring) directions in the ring
     phi0: Tensor  # (ring) radians
     offset: Tensor  # (ring) node of the ring's first direction
 

@@ -112,9 +112,10 @@ def read_arrays(path: str | Path) -> tuple[Float[Tensor, "V 3"], Int[Tensor, "F 
     )
     if not torch.isfinite(vertices).all():
         raise GeometryError(f"{path.name}: expected finite vertex positions, got NaN or infinity")
-    if any(uv is None or len(uv) == 0 for uv in uvs):
+    found = [uv for uv in uvs if uv is not None and len(uv)]
+    if len(found) < len(parts):
         return vertices, faces, None
-    return vertices, faces, torch.from_numpy(np.concatenate(uvs).astype(np.float32))
+    return vertices, faces, torch.from_numpy(np.concatenate(found).astype(np.float32))
 
 
 def dress(

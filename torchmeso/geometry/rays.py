@@ -53,7 +53,7 @@ class RayScene:
             np.ascontiguousarray(vertices.detach().float().numpy()),
             np.ascontiguousarray(faces.int().numpy()),
         )
-        self._scene = rtcore_scene.EmbreeScene(robust=True)
+        self._scene = rtcore_scene.EmbreeScene(robust=True)  # pyright: ignore[reportAttributeAccessIssue]
         self._mesh = TriangleMesh(self._scene, *self._arrays)
         self._run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32), None)  # commits the scene
 

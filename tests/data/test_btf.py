@@ -1,0 +1,105 @@
+import math
+
+import pytest
+import torch
+
+from tests.tolerances import FLOAT64
+from torchmeso.data import btf as btf_module
+from torchmeso.data.address import texel_centres
+from torchmeso.data.btf import Btf
+from torchmeso.errors import FormatError, ShapeError
+from torchmeso.geometry import hemisphere
+from torchmeso.geometry.directions import from_angles, normalize
+
+LIGHTS, VIEWS = hemisphere.grid(4, 3, 80), hemisphere.grid(3, 2, 75)
+
+
+def random_btf(rng, size=5, dtype=torch.float64):
+    images = torch.rand(len(LIGHTS), len(VIEWS), size, size + 1, 3, dtype=torch.float64, generator=rng)
+    return Btf(images=images.to(dtype), lights=LIGHTS, views=VIEWS, h=0.1)
+
+
+def lambert(albedo=0.6):
+    cosine = LIGHTS.directions(torch.float64)[:, 2]
+    images = (albedo * cosine)[:, None, None, None, None].expand(len(LIGHTS), len(VIEWS), 4, 4, 3).contiguous()
+    return Btf(images=images, lights=LIGHTS, views=VIEWS)
+
+
+def test_exact_at_the_samples(rng):
+    btf = random_btf(rng)
+    uv = texel_centres(5, 6, torch.float64)
+    for l in (0, 7):
+        for v in (0, 5):
+            wi, wo = LIGHTS.directions(torch.float64)[l], VIEWS.directions(torch.float64)[v]
+            T = btf.evaluate(uv, wi.expand(5, 6, 3), wo.expand(5, 6, 3))
+            torch.testing.assert_close(T, btf.images[l, v], **FLOAT64)
+
+
+def test_lambert_falls_to_zero_at_the_horizon():
+    theta = torch.tensor([80.0, 85.0, 89.0, 90.0, 100.0], dtype=torch.float64).deg2rad()
+    wi = from_angles(theta, torch.zeros(5, dtype=torch.float64))
+    wo = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand(5, 3)
+    T = lambert().evaluate(torch.rand(5, 2, dtype=torch.float64), wi, wo)[:, 0]
+    torch.testing.assert_close(T, 0.6 * theta.cos().clamp(min=0), rtol=1e-9, atol=1e-12)
+
+
+def test_ambient_of_a_lambertian_is_its_albedo():
+    wo = torch.tensor([[0.3, 0.0, 0.95]], dtype=torch.float64)
+    ambient = lambert().ambient(torch.zeros(1, 2, dtype=torch.float64), wo)
+    assert float(ambient[0, 0]) == pytest.approx(0.6, rel=4e-2)  # three rings of lights; measured 2.6e-2
+
+
+def test_continuous_along_light_and_view_sweeps(rng):
+    btf = random_btf(rng)
+    uv = torch.tensor([0.31, 0.77], dtype=torch.float64)
+    fixed = normalize(torch.tensor([0.3, 0.5, 0.6], dtype=torch.float64))
+    for swept in ("wi", "wo"):
+        jumps = []
+        for n in (2_000, 4_000):
+            theta = torch.linspace(-2.0, 2.0, n, dtype=torch.float64)
+            w = from_angles(theta, torch.full_like(theta, 0.7))
+            still = fixed.expand(n, 3)
+            T = btf.evaluate(uv.expand(n, 2), *((w, still) if swept == "wi" else (still, w)))
+            jumps.append(T.diff(dim=0).abs().max())
+        assert jumps[1] < 0.6 * jumps[0]
+
+
+def test_gradient(rng):
+    btf = random_btf(rng)
+    uv = torch.rand(4, 2, dtype=torch.float64, generator=rng).requires_grad_()
+    theta = torch.tensor([0.2, 0.6, 1.0, 1.3], dtype=torch.float64)
+    wi = from_angles(theta, torch.tensor([0.2, 1.0, 2.0, -1.0], dtype=torch.float64)).requires_grad_()
+    wo = from_angles(theta.flip(0), torch.tensor([0.3, 1.1, 2.2, -1.2], dtype=torch.float64)).requires_grad_()
+    assert torch.autograd.gradcheck(btf.evaluate, (uv, wi, wo))
+
+
+def test_round_trip_through_disk(tmp_path, rng):
+    btf = random_btf(rng, dtype=torch.float16)
+    btf_module.save(btf, tmp_path / "a.btf.zarr", samples=4)
+    back = btf_module.load(tmp_path / "a.btf.zarr")
+    assert torch.equal(back.pictures(), btf.images)
+    assert torch.equal(back.rows(1, 3), btf.rows(1, 3))
+    assert (back.lights, back.views, back.h) == (LIGHTS, VIEWS, 0.1)
+
+
+@pytest.mark.errors
+def test_values_that_do_not_fit_are_refused(tmp_path):
+    images = torch.full((len(LIGHTS), len(VIEWS), 2, 2, 3), 1e6)
+    with pytest.raises(ShapeError, match="expected values that fit float16, got one beyond it; store float32"):
+        btf_module.save(Btf(images=images, lights=LIGHTS, views=VIEWS), tmp_path / "a.btf.zarr")
+    btf_module.save(Btf(images=images, lights=LIGHTS, views=VIEWS), tmp_path / "a.btf.zarr", dtype="float32")
+
+
+@pytest.mark.errors
+def test_bad_tables_are_refused(tmp_path, rng):
+    with pytest.raises(ShapeError, match=r"btf\.images: expected shape \(12, 6, any, any, 3\)"):
+        Btf(images=torch.zeros(11, 6, 2, 2, 3), lights=LIGHTS, views=VIEWS)
+    images = torch.zeros(12, 6, 4, 4, 3)
+    images[3, 2, 3, 1, 0] = math.nan
+    with pytest.raises(ShapeError, match="got nan at light 3, view 2, row 3, column 1"):
+        Btf(images=images, lights=LIGHTS, views=VIEWS).rows(2, 4)
+    btf_module.save(random_btf(rng), tmp_path / "a.btf.zarr")
+    meta = tmp_path / "a.btf.zarr" / "zarr.json"
+    meta.write_text(meta.read_text().replace('"lights"', '"was_lights"'))
+    with pytest.raises(FormatError, match="expected 'lights' in the table"):
+        btf_module.load(tmp_path / "a.btf.zarr")

@@ -1,0 +1,57 @@
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from torchmeso.data import image
+from torchmeso.errors import FormatError
+
+
+def test_png_round_trip_is_within_half_a_code(tmp_path, rng):
+    rgb = torch.rand(9, 7, 3, generator=rng)
+    image.write_png(tmp_path / "a.png", rgb)
+    back = image.read(tmp_path / "a.png")
+    assert (image.to_srgb(back) - image.to_srgb(rgb)).abs().max() <= 0.5 / 255 + 1e-6
+
+
+def test_gamma_is_applied_once(tmp_path):
+    image.write_png(tmp_path / "a.png", torch.full((1, 1, 3), 0.2140))
+    assert np.asarray(Image.open(tmp_path / "a.png"))[0, 0].tolist() == [127, 127, 127]
+
+
+def test_srgb_inverts(rng):
+    x = torch.rand(1000, dtype=torch.float64, generator=rng)
+    torch.testing.assert_close(image.to_linear(image.to_srgb(x)), x, rtol=0, atol=1e-7)
+
+
+def test_exr_round_trip_of_a_strided_picture(tmp_path, rng):
+    rgb = (torch.rand(3, 6, 8, generator=rng) * 100).permute(1, 2, 0).flip(1)
+    depth = torch.rand(8, 6, generator=rng).T
+    image.write_exr(tmp_path / "a.exr", rgb, Z=depth)
+    assert torch.equal(image.read(tmp_path / "a.exr"), rgb)
+
+
+def test_height_pictures_are_not_touched_by_gamma(tmp_path):
+    Image.fromarray(np.array([[0, 32768, 65535]], dtype=np.uint16)).save(tmp_path / "h.png")
+    assert torch.allclose(image.read_data(tmp_path / "h.png"), torch.tensor([[0.0, 0.500008, 1.0]]), atol=1e-6)
+    Image.fromarray(np.array([[0, 51, 255]], dtype=np.uint8)).save(tmp_path / "h8.png")
+    assert torch.allclose(image.read_data(tmp_path / "h8.png"), torch.tensor([[0.0, 0.2, 1.0]]))
+
+
+def test_nan_and_overflow_become_black_and_white():
+    rgb = torch.tensor([[[torch.nan, torch.inf, -1.0]]])
+    assert image.to_bytes(rgb).tolist() == [[[0, 255, 0]]]
+
+
+@pytest.mark.errors
+def test_missing_and_damaged_pictures_say_so(tmp_path):
+    for reader in (image.read, image.read_data):
+        for name in ("no.png", "no.exr"):
+            with pytest.raises(FormatError, match="expected a picture, found none"):
+                reader(tmp_path / name)
+    (tmp_path / "bad.png").write_bytes(b"\x89PNG\r\n\x1a\n1234")
+    with pytest.raises(FormatError, match="expected a PNG, JPEG or EXR"):
+        image.read(tmp_path / "bad.png")
+    (tmp_path / "bad.exr").write_bytes(b"1234")
+    with pytest.raises(FormatError, match="expected an OpenEXR"):
+        image.read(tmp_path / "bad.exr")

@@ -1,0 +1,43 @@
+"""Storage of eigen maps: uint8 codes with a scale and an offset per component and channel, or floats.
+
+Test: tests/compress/test_quantize.py
+"""
+
+from typing import Literal, NamedTuple
+
+import torch
+from jaxtyping import Float, Shaped
+from torch import Tensor
+
+Storage = Literal["uint8", "float16", "float32"]
+
+
+class Codes(NamedTuple):
+    """Quantised values: value = offset + scale * code.
+
+    Attributes:
+        codes: (..., rank, 3) in the storage type.
+        scale: (rank, 3) float32.
+        offset: (rank, 3) float32.
+    """
+
+    codes: Shaped[Tensor, "*batch rank 3"]
+    scale: Float[Tensor, "rank 3"]
+    offset: Float[Tensor, "rank 3"]
+
+
+def quantize(values: Float[Tensor, "*batch rank 3"], storage: Storage) -> Codes:
+    """Return `values` in `storage`; uint8 spreads its 256 codes over the range of each component and channel.
+
+    float16 keeps eleven bits relative to the largest value, so that maps of any range fit.
+    """
+    flat = values.reshape(-1, *values.shape[-2:])
+    low, high = flat.amin(0), flat.amax(0)
+    if storage == "uint8":
+        step = ((high - low) / 255).clamp(min=torch.finfo(torch.float32).tiny)
+        return Codes(((values - low) / step).round().clamp(0, 255).to(torch.uint8), step, low)
+    zero = torch.zeros_like(low)
+    if storage == "float16":
+        size = torch.maximum(high.abs(), low.abs()).clamp(min=torch.finfo(torch.float32).tiny)
+        return Codes((values / size).to(torch.float16), size, zero)
+    return Codes(values.float(), torch.ones_like(low), zero)

@@ -1,0 +1,180 @@
+"""The bidirectional texture function as measured or baked: one picture per light and view.
+
+Values are T = pi f_r cos(theta_i), linear RGB, unclamped. Pictures may lie in memory or on disk; `rows` reads
+a band of texels either way, so that fits can stream.
+
+Test: tests/data/test_btf.py
+"""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import torch
+import zarr
+from jaxtyping import Float
+from torch import Tensor
+
+from torchmeso.data import address, store
+from torchmeso.errors import FormatError, ShapeError, check_shape
+from torchmeso.geometry import hemisphere
+from torchmeso.geometry.hemisphere import DirectionSet
+
+
+class Evaluable(Protocol):
+    """Anything that shading can ask for reflectance: `Btf`, `EigenBtf`."""
+
+    def evaluate(
+        self, uv: Float[Tensor, "*batch 2"], wi: Float[Tensor, "*batch 3"], wo: Float[Tensor, "*batch 3"]
+    ) -> Float[Tensor, "*batch 3"]:
+        """Return T(uv, wi, wo), linear RGB; local frame, 0 for wi below the horizon."""
+        ...
+
+    def ambient(self, uv: Float[Tensor, "*batch 2"], wo: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        """Return L_a(uv, wo) = (1/pi) times the integral of T over the light hemisphere (white: 1)."""
+        ...
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Btf:
+    """A table of T over light, view and texel.
+
+    Attributes:
+        images: (light, view, H, W, 3), in memory or a Zarr array on disk.
+        lights: directions towards the light.
+        views: directions towards the viewer.
+        h: slab depth of the mesostructure in tile units; 0 where it is unknown.
+    """
+
+    images: Float[Tensor, "light view H W 3"] | zarr.Array
+    lights: DirectionSet
+    views: DirectionSet
+    h: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Raise ShapeError unless the directions match the images."""
+        check_shape("btf.images", self.images, (len(self.lights), len(self.views), -1, -1, 3))
+
+    @property
+    def texels(self) -> tuple[int, int]:
+        """Height and width of the texture."""
+        return self.images.shape[2], self.images.shape[3]
+
+    def rows(self, start: int, stop: int) -> Float[Tensor, "light view rows W 3"]:
+        """Return texel rows start .. stop of all pictures as float32, reading no others.
+
+        Raises:
+            ShapeError: a value is not finite (the place is named).
+        """
+        if isinstance(self.images, Tensor):
+            band = self.images[:, :, start:stop].float()
+        else:
+            band = torch.from_numpy(np.asarray(self.images[:, :, start:stop])).float()
+        if not bool(torch.isfinite(band).all()):
+            light, view, row, column, _ = (~torch.isfinite(band)).nonzero()[0].tolist()
+            raise ShapeError(
+                f"btf.images: expected finite values, got {float(band[light, view, row, column].sum())} "
+                f"at light {light}, view {view}, row {start + row}, column {column}"
+            )
+        return band
+
+    def pictures(self) -> Float[Tensor, "light view H W 3"]:
+        """Return all pictures, read into memory, in the dtype they are stored in."""
+        if isinstance(self.images, Tensor):
+            return self.images
+        return torch.from_numpy(np.asarray(self.images[:]))
+
+    def evaluate(
+        self, uv: Float[Tensor, "*batch 2"], wi: Float[Tensor, "*batch 3"], wo: Float[Tensor, "*batch 3"]
+    ) -> Float[Tensor, "*batch 3"]:
+        """Return T(uv, wi, wo): 4 lights x 4 views x 4 texels, C0 everywhere, 0 for wi below the horizon."""
+        light = hemisphere.interpolate(self.lights, wi)
+        return self._sum_taps(uv, wo, light.node, light.weight, self._nodes) * horizon_falloff(self.lights, wi)
+
+    def ambient(self, uv: Float[Tensor, "*batch 2"], wo: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        """Return L_a(uv, wo) = (1/pi) times the integral of T over the light hemisphere (white: 1)."""
+        zero = torch.zeros_like(uv[..., :1], dtype=torch.long)
+        return self._sum_taps(uv, wo, zero, torch.ones_like(uv[..., :1]), self._ambient_nodes)
+
+    def _sum_taps(self, uv: Tensor, wo: Tensor, light: Tensor, light_weight: Tensor, table: Tensor) -> Tensor:
+        height, width = self.texels
+        taps = address.bilinear(uv, height, width)
+        view = hemisphere.interpolate(self.views, wo)
+        picture = light[..., :, None] * self.views.n_nodes + view.node[..., None, :]
+        index = picture[..., None] * (height * width) + taps.texel[..., None, None, :]
+        weight = light_weight[..., :, None, None] * view.weight[..., None, :, None] * taps.weight[..., None, None, :]
+        values = table[index.flatten(-3)].to(uv.dtype)
+        return (values * weight.flatten(-3).unsqueeze(-1)).sum(-2)
+
+    @cached_property
+    def _nodes(self) -> Tensor:
+        """(nodes of light x nodes of view x texel, 3), the poles appended."""
+        images = self.pictures()
+        with_light_pole = hemisphere.with_pole(images, self.lights, dim=0)
+        return hemisphere.with_pole(with_light_pole, self.views, dim=1).reshape(-1, 3)
+
+    @cached_property
+    def _ambient_nodes(self) -> Tensor:
+        """(nodes of view x texel, 3): the light hemisphere integrated."""
+        images = self.pictures()
+        weights = (hemisphere.quadrature(self.lights) / math.pi).float()
+        total = torch.zeros(images.shape[1:], dtype=torch.float32)
+        for l, weight in enumerate(weights):
+            total += weight * images[l].float()
+        return hemisphere.with_pole(total, self.views).reshape(-1, 3)
+
+
+def horizon_falloff(lights: DirectionSet, wi: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 1"]:
+    """Return the factor of T beyond the last ring of lights: cos(theta_i) / cos(last), 0 below the horizon."""
+    return (wi[..., 2:] / math.cos(lights.last)).clamp(0, 1)
+
+
+def load(path: str | Path) -> Btf:
+    """Return the BTF of a raw table (.btf.zarr); its pictures stay on disk until they are read.
+
+    Raises:
+        FormatError: the table is missing, damaged or of another kind.
+    """
+    group = store.open_table(path, "btf")
+    try:
+        about, images = store.attributes(group), group["images"]
+        assert isinstance(images, zarr.Array)
+        lights, views = hemisphere.parse(about["lights"]), hemisphere.parse(about["views"])
+        return Btf(images=images, lights=lights, views=views, h=about["h"])
+    except KeyError as error:
+        raise FormatError(f"{path}: expected {error} in the table, found none; the copy may be incomplete") from error
+
+
+def save(btf: Btf, path: str | Path, *, dtype: str = "float16", **attributes: object) -> None:
+    """Write `btf` as a raw table (.btf.zarr), whole.
+
+    Raises:
+        ShapeError: a value does not fit `dtype` (float16 ends at 65,504; float32 holds all).
+    """
+    images = btf.pictures().to(getattr(torch, dtype))
+    if not bool(torch.isfinite(images).all()):
+        raise ShapeError(f"btf.images: expected values that fit {dtype}, got one beyond it; store float32")
+    attributes = {**table_attributes(btf.lights, btf.views, btf.h), **attributes}
+    writer = store.open_blocks(path, specs(tuple(images.shape), dtype), attributes)
+    writer["images"][:] = images.numpy()
+    writer.finish()
+
+
+def specs(shape: tuple[int, ...], dtype: str = "float16") -> dict[str, store.ArraySpec]:
+    """Return the layout of a raw table: one shard per view (a block of a bake), chunks of 4 lights x 32 x 32 texels."""
+    light, _, height, width, _ = shape
+    chunk = (min(light, 4), 1, min(height, 32), min(width, 32), 3)
+    whole = (-(-n // c) * c for n, c in zip((light, 1, height, width, 3), chunk, strict=True))
+    spec = store.ArraySpec(
+        shape=tuple(shape), dtype=dtype, chunks=chunk, shards=tuple(whole), axes=("light", "view", "H", "W", "C")
+    )
+    return {"images": spec}
+
+
+def table_attributes(lights: DirectionSet, views: DirectionSet, h: float) -> dict[str, object]:
+    """Return what a raw table says about itself."""
+    unit = "T = pi f_r cos(theta_i), linear RGB"
+    return {"kind": "btf", "lights": lights.name, "views": views.name, "h": h, "unit": unit}

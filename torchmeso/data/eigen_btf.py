@@ -1,0 +1,172 @@
+"""The eigen BTF, a run-time model: T(uv, wi, wo) = sum_k W_k(wo) E_k(uv, wi).
+
+wang2005mdf, section 5: the BTF as a matrix with rows (x, y, light, rgb) and columns view, cut to a few singular
+vectors. E_k are maps over lights and texels (the eigen maps), W_k weights over views; one W serves all three
+channels. Maps are stored as uint8 with a scale and an offset per component and channel, or as float16 or
+float32. Interpolation is linear, so it runs on the codes and decodes once.
+
+Test: tests/data/test_eigen_btf.py
+"""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import torch
+from jaxtyping import Float, Shaped
+from torch import Tensor
+
+from torchmeso.data import address, mdf, store
+from torchmeso.data.btf import horizon_falloff
+from torchmeso.data.mdf import Mdf
+from torchmeso.errors import FormatError, ShapeError, check_shape
+from torchmeso.geometry import hemisphere
+from torchmeso.geometry.hemisphere import DirectionSet
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class EigenBtf:
+    """Eigen maps and view weights.
+
+    Attributes:
+        maps: (light, H, W, rank, 3) codes of E: uint8, float16, float32 or float64.
+        weights: (view, rank) W, largest component first.
+        scale: (rank, 3) E = offset + scale * code.
+        offset: (rank, 3).
+        lights: directions towards the light.
+        views: directions towards the viewer.
+    """
+
+    maps: Shaped[Tensor, "light H W rank 3"]
+    weights: Float[Tensor, "view rank"]
+    scale: Float[Tensor, "rank 3"]
+    offset: Float[Tensor, "rank 3"]
+    lights: DirectionSet
+    views: DirectionSet
+
+    def __post_init__(self) -> None:
+        """Raise ShapeError unless the parts match."""
+        rank = self.weights.shape[-1]
+        check_shape("eigen.maps", self.maps, (len(self.lights), -1, -1, rank, 3))
+        check_shape("eigen.weights", self.weights, (len(self.views), rank))
+        check_shape("eigen.scale", self.scale, (rank, 3))
+        check_shape("eigen.offset", self.offset, (rank, 3))
+        if self.maps.dtype != torch.uint8 and not self.maps.is_floating_point():
+            raise ShapeError(f"eigen.maps: expected uint8 or a float type, got {self.maps.dtype}")
+
+    @property
+    def rank(self) -> int:
+        """Number of components."""
+        return self.weights.shape[1]
+
+    @property
+    def texels(self) -> tuple[int, int]:
+        """Height and width of the texture."""
+        return self.maps.shape[1], self.maps.shape[2]
+
+    def truncated(self, rank: int) -> "EigenBtf":
+        """Return the model with its first `rank` components only."""
+        return EigenBtf(
+            maps=self.maps[..., :rank, :],
+            weights=self.weights[:, :rank],
+            scale=self.scale[:rank],
+            offset=self.offset[:rank],
+            lights=self.lights,
+            views=self.views,
+        )
+
+    def evaluate(
+        self, uv: Float[Tensor, "*batch 2"], wi: Float[Tensor, "*batch 3"], wo: Float[Tensor, "*batch 3"]
+    ) -> Float[Tensor, "*batch 3"]:
+        """Return T(uv, wi, wo), linear RGB: 4 lights x 4 texels of E, 4 views of W; C0, differentiable.
+
+        Args:
+            uv: (..., 2) texture coordinates, unbounded.
+            wi: (..., 3) unit direction to the light, local frame; T = 0 below the horizon.
+            wo: (..., 3) unit direction to the viewer, local frame; held below the last ring.
+
+        Returns:
+            (..., 3); a low rank can make it slightly negative, which is left to the caller.
+        """
+        height, width = self.texels
+        taps = address.bilinear(uv, height, width)
+        light = hemisphere.interpolate(self.lights, wi)
+        index = (light.node[..., :, None] * (height * width) + taps.texel[..., None, :]).flatten(-2)
+        tap_weight = (light.weight[..., :, None] * taps.weight[..., None, :]).flatten(-2)
+        return self._combine(self._nodes[index], tap_weight, wo) * horizon_falloff(self.lights, wi)
+
+    def ambient(self, uv: Float[Tensor, "*batch 2"], wo: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        """Return L_a(uv, wo) = (1/pi) times the integral of T over the light hemisphere (white: 1)."""
+        taps = address.bilinear(uv, *self.texels)
+        E = (self._ambient_maps[taps.texel].to(uv.dtype) * taps.weight[..., None, None]).sum(-3)
+        return (E * self.view_weights(wo).unsqueeze(-1)).sum(-2)
+
+    def view_weights(self, wo: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch rank"]:
+        """Return W(wo), interpolated."""
+        view = hemisphere.interpolate(self.views, wo)
+        return (self._weight_nodes.to(wo.dtype)[view.node] * view.weight.unsqueeze(-1)).sum(-2)
+
+    def decoded(self) -> Float[Tensor, "light H W rank 3"]:
+        """Return the eigen maps E as floating-point values."""
+        return _decode(self.maps, self.scale, self.offset)
+
+    def _combine(self, codes: Tensor, tap_weight: Tensor, wo: Tensor) -> Tensor:
+        mean = (codes.to(wo.dtype) * tap_weight[..., None, None]).sum(-3)
+        E = self.offset.to(wo.dtype) + self.scale.to(wo.dtype) * mean
+        return (E * self.view_weights(wo).unsqueeze(-1)).sum(-2)
+
+    @cached_property
+    def _nodes(self) -> Tensor:
+        """(nodes of light x texel, rank, 3) codes, the pole appended."""
+        return hemisphere.with_pole(self.maps, self.lights).flatten(0, 2).contiguous()
+
+    @cached_property
+    def _weight_nodes(self) -> Tensor:
+        return hemisphere.with_pole(self.weights, self.views)
+
+    @cached_property
+    def _ambient_maps(self) -> Tensor:
+        """(texel, rank, 3): E integrated over the light hemisphere, over pi."""
+        share = (hemisphere.quadrature(self.lights) / math.pi).to(self.scale.dtype)
+        total = torch.zeros(self.maps.shape[1:], dtype=self.scale.dtype)
+        for l in range(len(self.lights)):
+            total += share[l] * _decode(self.maps[l], self.scale, self.offset)
+        return total.flatten(0, 1)
+
+
+def _decode(codes: Tensor, scale: Tensor, offset: Tensor) -> Tensor:
+    return offset + scale * codes.to(scale.dtype)
+
+
+def save(eigen: EigenBtf, path: str | Path, *, silhouette: Mdf | None = None, **meta: object) -> None:
+    """Write a run-time model (.meso): one tensor per component, and the material's MDF where it has one."""
+    tensors = {f"eigen.map.{k}": eigen.maps[..., k, :] for k in range(eigen.rank)}
+    tensors |= {"eigen.weights": eigen.weights, "eigen.scale": eigen.scale, "eigen.offset": eigen.offset}
+    about: dict[str, object] = {"lights": eigen.lights.name, "views": eigen.views.name, "rank": eigen.rank}
+    parts: dict[str, object] = {"kind": "eigen", "eigen": about, **meta}
+    if silhouette is not None:
+        mdf_tensors, parts["mdf"] = mdf.to_tensors(silhouette)
+        tensors |= mdf_tensors
+    store.write_model(path, tensors, parts)
+
+
+def load(path: str | Path, *, rank: int | None = None) -> EigenBtf:
+    """Return the eigen BTF of a run-time model, reading only the first `rank` components where that is given.
+
+    Raises:
+        FormatError: the file is missing, damaged, or holds no eigen BTF.
+    """
+    model = store.Model(path)
+    about = model.meta.get("eigen")
+    if about is None:
+        raise FormatError(f"{path}: expected an eigen BTF, found {', '.join(model.names()) or 'nothing'}")
+    kept = about["rank"] if rank is None else min(rank, about["rank"])
+    return EigenBtf(
+        maps=torch.stack([model.read(f"eigen.map.{k}") for k in range(kept)], -2),
+        weights=model.read("eigen.weights")[:, :kept],
+        scale=model.read("eigen.scale")[:kept],
+        offset=model.read("eigen.offset")[:kept],
+        lights=hemisphere.parse(about["lights"]),
+        views=hemisphere.parse(about["views"]),
+    )

@@ -1,0 +1,106 @@
+"""Pictures on disk: PNG and JPEG (sRGB) and OpenEXR (linear), as linear RGB float tensors, row 0 on top.
+
+Test: tests/data/test_image.py
+"""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchmeso.data.store import replacing
+from torchmeso.errors import FormatError
+
+
+def read(path: str | Path) -> Float[Tensor, "H W 3"]:
+    """Return a colour picture as linear RGB; PNG and JPEG are taken as sRGB, EXR as linear.
+
+    Raises:
+        FormatError: the file is missing or unreadable.
+    """
+    if Path(path).suffix.lower() == ".exr":
+        return _read_exr(Path(path))
+    return to_linear(torch.from_numpy(_read_pillow(path, "RGB").astype(np.float32) / 255))
+
+
+def read_data(path: str | Path) -> Float[Tensor, "H W"]:
+    """Return a one-channel picture that holds data, not colour (a height, a mask), in [0, 1] as stored.
+
+    Raises:
+        FormatError: the file is missing or unreadable.
+    """
+    if Path(path).suffix.lower() == ".exr":
+        return _read_exr(Path(path))[..., 0]
+    grey = _read_pillow(path, None)
+    if grey.ndim == 3:
+        grey = grey[..., 0]
+    return torch.from_numpy(grey.astype(np.float32) / (65535 if grey.dtype in (np.uint16, np.int32) else 255))
+
+
+def write_png(path: str | Path, rgb: Float[Tensor, "H W 3"]) -> None:
+    """Write linear RGB as an 8-bit sRGB picture: exposure 0, clipped to [0, 1]."""
+    from PIL import Image
+
+    with replacing(path) as beside:
+        Image.fromarray(to_bytes(rgb)).save(beside, format="PNG")
+
+
+def write_exr(path: str | Path, rgb: Float[Tensor, "H W 3"], **channels: Float[Tensor, "H W"]) -> None:
+    """Write linear RGB, and further named channels such as depth, as float32 OpenEXR (ZIP)."""
+    import OpenEXR
+
+    # Contiguous copies in a dictionary of our own: the writer garbles strided arrays and changes the dictionary.
+    planes = {"RGB": np.array(rgb.detach().float().numpy(), order="C", copy=True)}
+    planes |= {name: np.array(x.detach().float().numpy(), order="C", copy=True) for name, x in channels.items()}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with replacing(path) as beside:
+        OpenEXR.File(header, planes).write(str(beside))
+
+
+def to_bytes(rgb: Float[Tensor, "H W 3"]) -> np.ndarray:
+    """Return linear RGB as (H, W, 3) sRGB bytes; not-a-number becomes 0."""
+    srgb = to_srgb(torch.nan_to_num(rgb.detach().float(), nan=0.0).clamp(0, 1))
+    return (srgb * 255 + 0.5).to(torch.uint8).numpy()
+
+
+def to_linear(srgb: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """Return linear values of sRGB ones (IEC 61966-2-1)."""
+    return torch.where(srgb <= 0.04045, srgb / 12.92, ((srgb.clamp(min=0) + 0.055) / 1.055) ** 2.4)
+
+
+def to_srgb(linear: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """Return sRGB values of linear ones: the inverse of `to_linear`."""
+    return torch.where(linear <= 0.0031308, linear * 12.92, 1.055 * linear.clamp(min=0) ** (1 / 2.4) - 0.055)
+
+
+def _read_pillow(path: str | Path, mode: str | None) -> np.ndarray:
+    from PIL import Image, UnidentifiedImageError
+
+    if not Path(path).is_file():
+        raise FormatError(f"{path}: expected a picture, found none; check the path")
+    try:
+        with Image.open(path) as picture:
+            return np.asarray(picture.convert(mode) if mode else picture)
+    except (UnidentifiedImageError, OSError, SyntaxError) as error:
+        raise FormatError(
+            f"{path}: expected a PNG, JPEG or EXR picture ({error}); the copy may be incomplete"
+        ) from error
+
+
+def _read_exr(path: Path) -> Tensor:
+    import OpenEXR
+
+    if not path.is_file():
+        raise FormatError(f"{path}: expected a picture, found none; check the path")
+    try:
+        channels = OpenEXR.File(str(path)).channels()
+    except Exception as error:  # the binding raises RuntimeError and others
+        raise FormatError(f"{path}: expected an OpenEXR picture ({error}); the copy may be incomplete") from error
+    if "RGB" in channels or "RGBA" in channels:
+        pixels = channels["RGB" if "RGB" in channels else "RGBA"].pixels[..., :3]
+    else:
+        only = channels.get("Y") or next(iter(channels.values()))
+        pixels = np.repeat(only.pixels[..., None], 3, axis=-1)
+    return torch.from_numpy(np.ascontiguousarray(pixels, dtype=np.float32))

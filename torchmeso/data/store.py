@@ -1,0 +1,245 @@
+"""Native files: written beside and renamed, so that nothing is ever half-written, and resumable by blocks.
+
+Raw tables (.btf.zarr, .mdf.zarr) are Zarr 3 groups filled block by block; a job that was cut off leaves
+`<name>.part` with the blocks it finished, and the same job goes on from there. Run-time models (.meso) are
+safetensors files, one tensor per component, memory-mapped: what is not asked for is never read.
+
+Test: tests/data/test_store.py
+"""
+
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import zarr
+from torch import Tensor
+from zarr.codecs import BloscCodec
+
+from torchmeso.errors import FormatError
+
+FORMAT_VERSION = 1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ArraySpec:
+    """Shape and layout of one array of a raw table.
+
+    Attributes:
+        shape: whole shape.
+        dtype: numpy name.
+        chunks: what is compressed, and can be read, alone.
+        shards: what one file holds; a block of a job is made of whole shards.
+        axes: names of the axes, kept with the array.
+    """
+
+    shape: tuple[int, ...]
+    dtype: str
+    chunks: tuple[int, ...]
+    shards: tuple[int, ...]
+    axes: tuple[str, ...]
+
+
+class BlockWriter:
+    """A raw table in the making: arrays to write blocks into, and which blocks are done."""
+
+    def __init__(self, part: Path, target: Path, group: zarr.Group):
+        """Use `open_blocks`."""
+        self._part, self._target, self._group = part, target, group
+
+    def __getitem__(self, name: str) -> zarr.Array:
+        """Return the array `name` to write into."""
+        return _array(self._group, name)
+
+    def is_done(self, block: int) -> bool:
+        """Return whether an earlier run finished `block`."""
+        return (self._part / "done" / str(block)).exists()
+
+    def mark_done(self, block: int) -> None:
+        """Record that all arrays of `block` are written."""
+        (self._part / "done" / str(block)).touch()
+
+    def finish(self) -> None:
+        """Give the finished table its name."""
+        _replace_directory(self._part / "table", self._target)
+        shutil.rmtree(self._part)
+
+
+def open_blocks(path: str | Path, specs: Mapping[str, ArraySpec], attributes: dict[str, Any]) -> BlockWriter:
+    """Return a writer for the raw table `path`, resumed where an earlier run of the same job stopped.
+
+    The same job means equal specs and attributes; anything else in `<path>.part` is thrown away.
+    """
+    path = Path(path)
+    part = path.with_name(path.name + ".part")
+    key = content_hash({name: _spec_as_json(spec) for name, spec in specs.items()}, attributes)
+    if part.exists() and _key_of(part) != key:
+        shutil.rmtree(part)
+    fresh = not part.exists()
+    (part / "done").mkdir(parents=True, exist_ok=True)
+    group = zarr.open_group(str(part / "table"), mode="a", zarr_format=3)
+    if fresh:
+        for name, spec in specs.items():
+            group.create_array(
+                name,
+                shape=spec.shape,
+                dtype=spec.dtype,
+                chunks=spec.chunks,
+                shards=spec.shards,
+                dimension_names=spec.axes,
+                compressors=BloscCodec(cname="lz4", shuffle="shuffle"),
+            )
+        group.attrs.update({**attributes, "format": FORMAT_VERSION})
+        (part / "key").write_text(key)
+    return BlockWriter(part, path, group)
+
+
+def open_table(path: str | Path, kind: str) -> zarr.Group:
+    """Return the raw table at `path` for reading.
+
+    Raises:
+        FormatError: it is missing, is unfinished, is no table of this `kind`, or is of a newer format.
+    """
+    path = Path(path)
+    if not path.is_dir():
+        part = path.with_name(path.name + ".part")
+        hint = "; an unfinished bake lies beside it, run the same bake again" if part.exists() else "; bake it first"
+        raise FormatError(f"{path}: expected a {kind} table, found none{hint}")
+    try:
+        group = zarr.open_group(str(path), mode="r")
+    except Exception as error:  # zarr raises many kinds on damaged metadata
+        raise FormatError(
+            f"{path}: expected a Zarr group ({type(error).__name__}); the copy may be incomplete"
+        ) from error
+    about = attributes(group)
+    if about.get("kind") != kind:
+        raise FormatError(f"{path}: expected a {kind} table, got '{about.get('kind', 'something else')}'")
+    if about.get("format", 0) > FORMAT_VERSION:
+        raise FormatError(f"{path}: written by a newer torchmeso (format {about['format']}); update torchmeso")
+    return group
+
+
+def attributes(group: zarr.Group) -> dict[str, Any]:
+    """Return what a raw table says about itself."""
+    return dict(group.attrs)
+
+
+def read_array(group: zarr.Group, name: str, selection: Any = Ellipsis) -> Tensor:
+    """Return (part of) an array of a table.
+
+    Raises:
+        FormatError: the array is missing or a chunk is damaged.
+    """
+    try:
+        return torch.from_numpy(np.asarray(_array(group, name)[selection]))
+    except Exception as error:  # zarr and numcodecs raise many kinds on damaged chunks
+        raise FormatError(
+            f"{group.store_path}: '{name}' cannot be read ({type(error).__name__}); the copy may be incomplete"
+        ) from error
+
+
+def write_model(path: str | Path, tensors: Mapping[str, Tensor], meta: dict[str, Any]) -> None:
+    """Write a run-time model: `tensors` by name, `meta` as JSON."""
+    from safetensors.torch import save_file
+
+    header = {"torchmeso": json.dumps({**meta, "format": FORMAT_VERSION})}
+    with replacing(path) as beside:
+        save_file({name: x.contiguous() for name, x in tensors.items()}, str(beside), metadata=header)
+
+
+class Model:
+    """A run-time model on disk: metadata now, tensors when asked for."""
+
+    def __init__(self, path: str | Path):
+        """Read the header of `path`.
+
+        Raises:
+            FormatError: the file is missing, damaged, or no model of ours.
+        """
+        from safetensors import SafetensorError, safe_open
+
+        self.path = Path(path)
+        if not self.path.is_file():
+            raise FormatError(
+                f"{path}: expected a run-time model (.meso), found none; make one with torchmeso compress"
+            )
+        try:
+            self._file = safe_open(str(path), framework="pt")
+        except SafetensorError as error:
+            raise FormatError(f"{path}: expected a safetensors file ({error}); the copy may be incomplete") from error
+        header = self._file.metadata() or {}
+        if "torchmeso" not in header:
+            raise FormatError(f"{path}: expected a model written by torchmeso, got another safetensors file")
+        self.meta: dict[str, Any] = json.loads(header["torchmeso"])
+        if self.meta.get("format", 0) > FORMAT_VERSION:
+            raise FormatError(f"{path}: written by a newer torchmeso (format {self.meta['format']}); update torchmeso")
+
+    def names(self) -> list[str]:
+        """Return the names of all tensors."""
+        return list(self._file.keys())
+
+    def read(self, name: str) -> Tensor:
+        """Return one tensor.
+
+        Raises:
+            FormatError: there is none of that name.
+        """
+        if name not in self._file.keys():
+            raise FormatError(f"{self.path}: expected a tensor '{name}', found none")
+        return self._file.get_tensor(name)
+
+
+@contextmanager
+def replacing(path: str | Path) -> Iterator[Path]:
+    """Yield a file name beside `path` to write to; it takes the name `path` when the block ends without error."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = path.with_name(f".{os.getpid()}-{path.name}")
+    try:
+        yield beside
+        os.replace(beside, path)
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+def content_hash(*parts: Any) -> str:
+    """Return a short hash of JSON-like parts, the same on every machine."""
+    text = json.dumps(parts, sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:24]
+
+
+def cache_dir() -> Path:
+    """Return the folder of cached bakes: TORCHMESO_CACHE, else ~/.cache/torchmeso."""
+    return Path(os.environ.get("TORCHMESO_CACHE", Path.home() / ".cache" / "torchmeso"))
+
+
+def _replace_directory(source: Path, target: Path) -> None:
+    """Rename a folder over another one; the old one is only removed once the new one has its name."""
+    old = target.with_name(f".old-{os.getpid()}-{target.name}")
+    if target.exists():
+        os.replace(target, old)
+    os.replace(source, target)
+    if old.exists():
+        shutil.rmtree(old)
+
+
+def _array(group: zarr.Group, name: str) -> zarr.Array:
+    array = group[name]
+    assert isinstance(array, zarr.Array)
+    return array
+
+
+def _key_of(part: Path) -> str:
+    key = part / "key"
+    return key.read_text() if key.is_file() else ""
+
+
+def _spec_as_json(spec: ArraySpec) -> list:
+    return [spec.shape, spec.dtype, spec.chunks, spec.shards, spec.axes]
