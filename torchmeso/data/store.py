@@ -191,7 +191,7 @@ class Model:
         Raises:
             FormatError: there is none of that name.
         """
-        if name not in self._file.keys():
+        if name not in self.names():
             raise FormatError(f"{self.path}: expected a tensor '{name}', found none")
         return self._file.get_tensor(name)
 
