@@ -1,10 +1,10 @@
 import math
-from itertools import pairwise
 
 import pytest
 import torch
 
-from torchmeso.geometry.directions import from_angles
+from torchmeso.geometry import shapes
+from torchmeso.geometry.directions import from_angles, normalize
 from torchmeso.geometry.light import DirectionalLight, PointLight
 from torchmeso.meso import generators
 from torchmeso.transport.materials import Palette
@@ -60,23 +60,18 @@ def test_white_furnace(rng):
         assert float(sky.mean()) == pytest.approx(1, abs=2e-3)  # what 60 bounces leave over
 
 
-def test_interreflection_adds_a_geometric_series(rng):
-    """Two facing walls far closer than they are wide: each bounce multiplies by the albedo."""
-    half, gap = 200.0, 1.0
-    quad = torch.tensor([[-half, -half, 0], [half, -half, 0], [half, half, 0], [-half, half, 0]])
-    palette = Palette(albedo=torch.full((1, 3), 0.5), alpha=torch.ones(1), f0=torch.zeros(1, 3))
-    faces, part = torch.tensor([[0, 1, 2], [0, 2, 3]]), torch.zeros(2, dtype=torch.long)
-    floor = Geometry(vertices=quad, faces=faces, part=part, palette=palette)
-    roof = Geometry(vertices=quad + torch.tensor([0, 0, gap]), faces=faces, part=part, palette=palette)
-    lamp = PointLight(position=torch.tensor([0.0, 0.0, 0.5]), intensity=torch.ones(3))
-    o = torch.tensor([[0.0, 0.0, 0.9]]).expand(20_000, 3).contiguous()
-    d = DOWN.expand(20_000, 3)
-    means = [float(radiance(MeshTracer(floor, roof), o, d, [lamp], bounces=b, rng=rng)[0].mean()) for b in (0, 1, 2, 3)]
-    direct = 0.5 / math.pi * (1 / 0.25)  # albedo / pi * intensity / r^2
-    assert means[0] == pytest.approx(direct, rel=1e-3)
-    added = [b - a for a, b in pairwise(means)]
-    assert added[0] > 0
-    assert added[2] / added[1] == pytest.approx(0.5, abs=0.1)
+def test_integrating_sphere_is_a_geometric_series(rng):
+    """Inside a diffuse sphere lit from its centre each bounce adds the same radiance times the albedo, exactly."""
+    ball = shapes.sphere(triangles=20_000)
+    palette = Palette(albedo=torch.full((1, 3), 0.6), alpha=torch.ones(1), f0=torch.zeros(1, 3))
+    part = torch.zeros(len(ball.faces), dtype=torch.long)
+    tracer = MeshTracer(Geometry(vertices=ball.vertices, faces=ball.faces, part=part, palette=palette))
+    lamp = PointLight(position=torch.zeros(3), intensity=torch.full((3,), math.pi))
+    d = normalize(torch.randn(2000, 3, generator=rng))
+    for bounces, expected in ((0, 0.6), (1, 0.96), (3, 1.3056)):
+        L, _, _ = radiance(tracer, torch.zeros(2000, 3), d, [lamp], bounces=bounces, rng=rng)
+        assert float(L.mean()) == pytest.approx(expected, rel=3e-3)  # facets
+        assert float(L.std()) < 0.02
 
 
 def test_point_light_is_blocked_and_limited(rng):

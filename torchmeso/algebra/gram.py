@@ -26,11 +26,11 @@ class RightBasis(NamedTuple):
     values: Float[Tensor, "n"]
 
 
-def gram(blocks: Iterable[Float[Tensor, "rows n"]], n: int, *, accurate: bool = False) -> Float[Tensor, "n n"]:
+def gram(blocks: Iterable[Tensor], n: int, *, accurate: bool = False) -> Float[Tensor, "n n"]:
     """Return the float64 Gram matrix of all rows of all blocks.
 
     Args:
-        blocks: the matrix, a few rows at a time.
+        blocks: the matrix, (rows, n) at a time; any number of rows.
         n: columns.
         accurate: multiply in float64 too: four times slower, for small singular values.
     """

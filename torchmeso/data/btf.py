@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -24,6 +24,7 @@ from torchmeso.geometry import hemisphere
 from torchmeso.geometry.hemisphere import DirectionSet
 
 
+@runtime_checkable
 class Evaluable(Protocol):
     """Anything that shading can ask for reflectance: `Btf`, `EigenBtf`."""
 

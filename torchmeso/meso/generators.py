@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from torchmeso.errors import ConfigError, check_range
@@ -17,7 +17,8 @@ from torchmeso.meso.mesostructure import Mesostructure, Rgb, palette
 from torchmeso.transport.materials import Palette
 from torchmeso.transport.tracer import Geometry
 
-Triangles = tuple[Float[Tensor, "V 3"], Int[Tensor, "F 3"]]
+Triangles = tuple[Tensor, Tensor]
+"""(V, 3) vertices and (F, 3) faces of one part."""
 
 
 def sheet(*, h: float = 0.1, albedo: Rgb = (0.5, 0.5, 0.5), roughness: float = 0.5, f0: float = 0.0) -> Mesostructure:

@@ -107,7 +107,7 @@ def from_file(
 def palette(*parts: tuple[Rgb, float, float]) -> Palette:
     """Return a palette from (albedo, roughness, f0) per part."""
     return Palette(
-        albedo=torch.tensor([p[0] for p in parts]),
-        alpha=torch.tensor([p[1] for p in parts]),
-        f0=torch.tensor([[p[2]] * 3 for p in parts]),
+        albedo=torch.tensor([p[0] for p in parts], dtype=torch.float32),
+        alpha=torch.tensor([p[1] for p in parts], dtype=torch.float32),
+        f0=torch.tensor([[p[2]] * 3 for p in parts], dtype=torch.float32),
     )

@@ -72,7 +72,7 @@ class Sample(NamedTuple):
 
 def evaluate(
     material: Reflectance, wi: Float[Tensor, "*#batch 3"], wo: Float[Tensor, "*#batch 3"]
-) -> Float[Tensor, "*batch 3"]:
+) -> Float[Tensor, "*#batch 3"]:
     """Return f_r(wi, wo); 0 where either direction is at or below the surface."""
     cos_i, cos_o = wi[..., 2:], wo[..., 2:]
     up = (cos_i > 0) & (cos_o > 0)
@@ -121,7 +121,7 @@ def pdf(material: Reflectance, wi: Float[Tensor, "n 3"], wo: Float[Tensor, "n 3"
     return torch.where(wi[..., 2] > 0, density, 0)
 
 
-def ndf(cos_h: Float[Tensor, "*batch"], alpha: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+def ndf(cos_h: Float[Tensor, "*#batch"], alpha: Float[Tensor, "*#batch"]) -> Float[Tensor, "*#batch"]:
     """Return the GGX density D of microfacet normals; walter2007microfacet, eq. (33)."""
     a2 = alpha.square()
     # 1 - cos^2 (1 - a^2), written so that float32 keeps the peak of a narrow lobe
@@ -129,7 +129,7 @@ def ndf(cos_h: Float[Tensor, "*batch"], alpha: Float[Tensor, "*batch"]) -> Float
     return a2 / (math.pi * inner.square())
 
 
-def fresnel(f0: Float[Tensor, "*batch 3"], cosine: Float[Tensor, "*batch 1"]) -> Float[Tensor, "*batch 3"]:
+def fresnel(f0: Float[Tensor, "*#batch 3"], cosine: Float[Tensor, "*#batch 1"]) -> Float[Tensor, "*#batch 3"]:
     """Return Schlick's reflectance; its grazing value is min(1, 50 f0), so that no coat stays no coat."""
     f90 = (50 * f0.amax(-1, keepdim=True)).clamp(max=1)
     return f0 + (f90 - f0).clamp(min=0) * (1 - cosine) ** 5

@@ -8,7 +8,7 @@ Test: tests/transport/test_tracer.py
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -69,6 +69,7 @@ class Surface(NamedTuple):
     material: Reflectance
 
 
+@runtime_checkable
 class Tracer(Protocol):
     """Something rays can be cast into."""
 
