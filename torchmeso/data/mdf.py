@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
 from torchmeso.data import address, store
+from torchmeso.data.relief import Relief, from_views
 from torchmeso.errors import FormatError, ShapeError, check_range, check_shape
 from torchmeso.geometry import hemisphere
 from torchmeso.geometry.hemisphere import DirectionSet
@@ -94,6 +95,23 @@ class Mdf:
             return (delta * weight).sum(-1), torch.zeros_like(weight[..., 0])
         missing = (missing_table[index] * weight).sum(-1)
         return (delta * weight).sum(-1) / (1 - missing).clamp(min=1e-6), missing
+
+    @cached_property
+    def relief(self) -> Relief:
+        """The height map that the first ring of views agrees on, finer than the texels; made when first asked for."""
+        count = self.directions.count[0]
+        wo = self.directions.directions(torch.float64)[:count]
+        drop = self.delta[:count].float() * (self.h / (255 if self.delta.dtype == torch.uint8 else 1))
+        no_hit = None if self.no_hit is None else self.no_hit[:count]
+        return from_views(drop, no_hit, (wo[:, :2] / wo[:, 2:]).float(), self.h)
+
+    def distance(self, uv: Float[Tensor, "n 2"], wo: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+        """Return D(uv, wo) by marching through the relief: for the few rays whose answer decides a silhouette."""
+        return self.relief.march(uv, wo, MIN_COS)
+
+    def depth(self, uv: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch"]:
+        """Return the depth of the relief straight below `uv`, in tile units; inf in holes."""
+        return self.relief.depth(uv)
 
     @cached_property
     def _nodes(self) -> tuple[Tensor, Tensor | None]:

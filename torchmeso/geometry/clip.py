@@ -9,7 +9,7 @@ Test: tests/geometry/test_clip.py
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 
@@ -67,8 +67,7 @@ def fan(polygons: Polygons) -> tuple[Float[Tensor, "n 3 D"], Int[Tensor, "n"]]:
     points, corners = polygons
     triangles, source = [], []
     for k in range(1, points.shape[1] - 1):
-        owner: Bool[Tensor, m] = corners > k + 1
-        which = owner.nonzero()[:, 0]
+        which = (corners > k + 1).nonzero()[:, 0]
         triangles.append(points[which][:, [0, k, k + 1]])
         source.append(which)
     return torch.cat(triangles), torch.cat(source)

@@ -52,7 +52,7 @@ class MdfOptions:
 
 
 class RayCastMdf:
-    """D by casting a ray for every question: the limit that tables approach. Same `evaluate` as `data.Mdf`."""
+    """D by casting a ray for every question: the limit that tables approach. Answers what `data.Mdf` answers."""
 
     def __init__(self, meso: Mesostructure):
         """Build the acceleration structure."""
@@ -74,6 +74,16 @@ class RayCastMdf:
         surface = self._tracer.trace(origin, -lifted)
         distance = (surface.t - ahead[:, 0]).clamp(min=0)
         return torch.where(surface.hit, torch.minimum(distance, self.h / lifted[:, 2]), torch.inf).to(uv.dtype)
+
+    def distance(self, uv: Float[Tensor, "n 2"], wo: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+        """Return D(uv, wo): every answer is as good as it gets."""
+        return self.evaluate(uv, wo)
+
+    def depth(self, uv: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch"]:
+        """Return how deep the material lies straight below `uv`, in tile units; inf in holes."""
+        flat = uv.reshape(-1, 2)
+        up = torch.tensor([0.0, 0.0, 1.0], dtype=uv.dtype)
+        return self.evaluate(flat, up.expand(len(flat), 3)).reshape(uv.shape[:-1])
 
 
 def bake(

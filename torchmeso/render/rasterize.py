@@ -95,6 +95,26 @@ def barycentric(layers: Layers, camera: Camera, which: Int[Tensor, "n"]) -> Floa
     return share.float()
 
 
+def depth_at(
+    triangles: Triangles, camera: Camera, which: Int[Tensor, "n"], xy: Float[Tensor, "n 2"]
+) -> Float[Tensor, "n"]:
+    """Return the depth t at which the rays through pixels `xy` meet the planes of triangles `which`.
+
+    Outside a triangle its plane is followed only as far as its own depth range: no needle can extrapolate.
+    """
+    corner = triangles.xy[which] / SUBPIXELS
+    to_corner = corner - xy.double()[:, None]
+    b, c = to_corner.roll(-1, 1), to_corner.roll(-2, 1)
+    share = b[..., 0] * c[..., 1] - b[..., 1] * c[..., 0]
+    turn = torch.where(triangles.front[which], -1.0, 1.0).to(torch.float64)
+    q_corner = triangles.q[which]
+    q = (share * q_corner).sum(1) * turn * (SUBPIXELS**2 / triangles.area[which])
+    q = q.clamp(min=q_corner.amin(1), max=q_corner.amax(1))
+    if camera.projection == "orthographic":
+        return q.float()
+    return (camera.rays(xy.double())[2] / q).float()
+
+
 def set_up(camera: Camera, vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Triangles:
     """Return the triangles of a mesh on the screen: projected, clipped, snapped, without those of no area."""
     projected = camera.project(vertices.double())

@@ -1,0 +1,42 @@
+import pytest
+import torch
+
+from torchmeso.data import image
+from torchmeso.errors import ConfigError
+from torchmeso.render import film
+from torchmeso.render.film import Picture
+
+
+def picture(rng):
+    owner = torch.tensor([[-1, 0, 0], [1, -2, -1]])
+    return Picture(
+        rgb=torch.rand(2, 3, 3, generator=rng), depth=torch.rand(2, 3, generator=rng), owner=owner,
+        shadowed=torch.zeros(1, 2, 3, dtype=torch.bool), counts={}, seconds={},
+    )  # fmt: skip
+
+
+def test_coverage_counts_objects(rng):
+    assert picture(rng).coverage == pytest.approx(4 / 6)
+
+
+def test_exr_keeps_values_and_depth(tmp_path, rng):
+    import OpenEXR
+
+    p = picture(rng)
+    film.write(p, tmp_path / "a.exr")
+    assert torch.equal(image.read(tmp_path / "a.exr"), p.rgb)
+    depth = OpenEXR.File(str(tmp_path / "a.exr")).channels()["Z"].pixels
+    assert torch.equal(torch.from_numpy(depth), p.depth)
+
+
+def test_png_is_srgb(tmp_path, rng):
+    p = picture(rng)
+    film.write(p, tmp_path / "a.png")
+    assert (image.read(tmp_path / "a.png") - p.rgb).abs().max() < 0.01
+
+
+@pytest.mark.errors
+def test_other_suffixes_are_refused(tmp_path, rng):
+    with pytest.raises(ConfigError, match=r"expected a name that ends in \.png or \.exr"):
+        film.write(picture(rng), tmp_path / "a.tiff")
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,83 @@
+import pytest
+import torch
+
+from tests.render.scenes import camera, scene, sun
+from tests.tolerances import FLOAT32
+from torchmeso.data.mdf import Mdf
+from torchmeso.errors import ConfigError
+from torchmeso.geometry import hemisphere, shapes
+from torchmeso.meso import generators
+from torchmeso.meso.bake_mdf import RayCastMdf
+from torchmeso.render.rasterize import rasterize
+from torchmeso.render.scene import DistanceFunction, Scene, assemble, interpolate, rays
+
+
+def test_assembled_meshes_keep_their_arrays():
+    a, b = shapes.sphere(triangles=200), shapes.plane(triangles=8)
+    world = assemble(scene(a, b))
+    assert len(world.faces) == len(a.faces) + len(b.faces)
+    assert torch.equal(world.vertices[world.faces[: len(a.faces)]], a.vertices[a.faces])
+    assert torch.equal(world.vertices[world.faces[len(a.faces) :]], b.vertices[b.faces])
+    assert world.owner.tolist() == [0] * len(a.faces) + [1] * len(b.faces)
+    assert world.closed.tolist() == [True, False]
+    assert world.component.max() == 1
+
+
+@pytest.mark.parametrize("projection", ["perspective", "orthographic"])
+def test_fragments_lie_on_the_rays_and_on_the_surface(projection):
+    """Sphere: positions have length 1, and the frame's normal is the position."""
+    subject = scene(shapes.sphere(triangles=20_000))
+    view = camera((1, 2, 3), projection=projection)
+    world = assemble(subject)
+    layers = rasterize(view, world.vertices, world.faces)
+    which = torch.arange(len(layers.t))
+    points = interpolate(world, layers, view, which)
+    torch.testing.assert_close(points.position.norm(dim=-1), torch.ones(len(which)), rtol=2e-3, atol=0)
+    torch.testing.assert_close(points.frame.n, points.position, rtol=0, atol=0.02)
+    assert (points.owner == 0).all()
+
+
+def test_texture_coordinates_are_perspective_correct():
+    """On a plane, uv is a known function of the position, at every fragment."""
+    plane = shapes.plane(size=(2, 2), tiles=(4, 4))
+    view = camera((0.3, 0.4, 1.5))
+    world = assemble(scene(plane))
+    layers = rasterize(view, world.vertices, world.faces)
+    points = interpolate(world, layers, view, torch.arange(len(layers.t)))
+    x, y, z = points.position.unbind(-1)
+    # Vertices are snapped to 1/256 pixel, so the ray of a pixel meets the snapped plane a little off.
+    torch.testing.assert_close(points.uv, torch.stack([(x + 1) * 2, (1 - z) * 2], -1), rtol=0, atol=0.02)
+    torch.testing.assert_close(points.frame.t, torch.tensor([1.0, 0, 0]).expand_as(points.frame.t), **FLOAT32)
+    torch.testing.assert_close(points.scale, torch.full_like(points.scale, 0.5), **FLOAT32)
+    assert y.abs().max() < 0.01
+
+
+def test_selected_points_are_the_same_points():
+    world = assemble(scene(shapes.sphere(triangles=200)))
+    view = camera((0, 0, 3))
+    layers = rasterize(view, world.vertices, world.faces)
+    points = interpolate(world, layers, view, torch.arange(len(layers.t)))
+    some = points.select(torch.tensor([5, 3]))
+    assert torch.equal(some.uv, points.uv[[5, 3]])
+    assert torch.equal(some.frame.b, points.frame.b[[5, 3]])
+
+
+def test_rays_go_through_pixel_centres():
+    view = camera((0, 0, 3), size=5)
+    _, direction, _ = rays(view, torch.tensor([12]))
+    torch.testing.assert_close(direction[0], torch.tensor([0.0, 0, -1]), **FLOAT32)
+
+
+def test_both_kinds_of_distance_answer_the_protocol():
+    views = hemisphere.grid(4, 2, 87.5)
+    table = Mdf(delta=torch.zeros(8, 2, 2), no_hit=None, directions=views, h=0.1)
+    for mdf in (table, RayCastMdf(generators.sheet())):
+        assert isinstance(mdf, DistanceFunction)
+
+
+@pytest.mark.errors
+def test_scenes_nobody_can_render_are_refused():
+    with pytest.raises(ConfigError, match="at least one object"):
+        Scene(objects=(), lights=(sun(0, 0, 1),))
+    with pytest.raises(ConfigError, match=r"scene\.ambient_rule: expected 'add' or 'paper', got 'either'"):
+        Scene(objects=scene(shapes.plane()).objects, lights=(), ambient_rule="either")

@@ -1,0 +1,136 @@
+"""One frame: shadow maps, layers, visibility, shading.
+
+    scene -> shadow map per light -> all layers of the camera -> intervals, depth test -> nearest -> shade
+
+Test: tests/render/test_frame.py
+"""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchmeso.errors import check_memory, check_range
+from torchmeso.geometry.camera import Camera
+from torchmeso.render import shadow_map
+from torchmeso.render.btf_shade import shade
+from torchmeso.render.film import Picture
+from torchmeso.render.rasterize import Layers, rasterize
+from torchmeso.render.scene import Scene, World, assemble, interpolate, rays
+from torchmeso.render.silhouette import Candidates, Counts, Silhouette, find_candidates, nearest
+
+MEMORY_LIMIT = 16 << 30
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FrameOptions:
+    """What a frame does.
+
+    Attributes:
+        silhouette: "curved" follows the curve of the surface, "paper" is the depth-interval test of wang2005mdf,
+            "none" renders the BTF on the bare mesh.
+        shadows: whether objects cast shadows.
+        shadow_map_size: texels along a side of a shadow map.
+    """
+
+    silhouette: Silhouette = "curved"
+    shadows: bool = True
+    shadow_map_size: int = 1024
+
+    def __post_init__(self) -> None:
+        """Raise ConfigError for a size out of range."""
+        check_range("render.shadow_map_size", self.shadow_map_size, 8, 16384)
+
+
+def render(scene: Scene, camera: Camera, options: FrameOptions | None = None) -> Picture:
+    """Return the picture of `scene` seen by `camera`.
+
+    Raises:
+        SizeError: the picture would need more memory than the limit.
+    """
+    options = options or FrameOptions()
+    check_memory("render", camera.width * camera.height * 600.0, MEMORY_LIMIT, "render fewer pixels")
+    seconds: dict[str, float] = {}
+    with _timed(seconds, "assemble"):
+        world = assemble(scene)
+    with _timed(seconds, "shadow maps"):
+        maps = _shadow_maps(scene, world, options)
+    with _timed(seconds, "layers"):
+        layers = rasterize(camera, world.vertices, world.faces)
+    with _timed(seconds, "visibility"):
+        candidates, counts = find_candidates(scene, world, camera, layers, options.silhouette)
+        first = nearest(candidates, candidates.depth)
+        seen = Candidates(*(x[first] for x in candidates))
+    with _timed(seconds, "shading"):
+        picture = _develop(scene, world, camera, layers, seen, maps)
+    return Picture(**picture, counts=_count(layers, counts, camera), seconds=seconds)
+
+
+def _shadow_maps(scene: Scene, world: World, options: FrameOptions) -> list[shadow_map.ShadowMap]:
+    if not options.shadows:
+        return []
+    size = options.shadow_map_size
+    return [shadow_map.build(scene, world, light, size=size, silhouette=options.silhouette) for light in scene.lights]
+
+
+def _develop(
+    scene: Scene,
+    world: World,
+    camera: Camera,
+    layers: Layers,
+    seen: Candidates,
+    maps: list[shadow_map.ShadowMap],
+) -> dict[str, Tensor]:
+    """Shade what is seen and lay it out as a picture."""
+    n_pixel = camera.width * camera.height
+    rgb = torch.tensor(scene.background).repeat(n_pixel, 1)
+    depth, owner = torch.full((n_pixel,), torch.inf), torch.full((n_pixel,), -1)
+    shadowed = torch.zeros(len(scene.lights), n_pixel, dtype=torch.bool)
+    depth[seen.pixel] = seen.depth
+
+    inside = seen.pixel[seen.fragment < 0]
+    rgb[inside], owner[inside] = 0, -2
+    outside = seen.fragment >= 0
+    pixel, fragment = seen.pixel[outside], seen.fragment[outside]
+    points = interpolate(world, layers, camera, fragment)
+    owner[pixel] = points.owner
+    origin, direction, _ = rays(camera, pixel)
+    receiver = origin + seen.depth[outside, None] * direction
+    dark = torch.zeros(len(scene.lights), len(pixel), dtype=torch.bool)
+    for l, shadow in enumerate(maps):
+        dark[l] = shadow_map.blocked(shadow, receiver)
+    shadowed[:, pixel] = dark
+    rgb[pixel] = shade(scene, points, -direction, dark)
+
+    size = (camera.height, camera.width)
+    return {
+        "rgb": rgb.reshape(*size, 3),
+        "depth": depth.reshape(size),
+        "owner": owner.reshape(size),
+        "shadowed": shadowed.reshape(-1, *size),
+    }
+
+
+def _count(layers: Layers, counts: Counts, camera: Camera) -> dict[str, int]:
+    per_pixel = layers.start.diff()
+    return {
+        "triangles drawn": len(layers.triangles.face),
+        "fragments": len(layers.t),
+        "layers": int(per_pixel.max()),
+        "pixels with a fragment": int((per_pixel > 0).sum()),
+        "pixels": camera.width * camera.height,
+        "intervals": counts.intervals,
+        "intervals passed by their length": counts.skipped,
+        "intervals carved": counts.carved,
+        "pixels inside an object": counts.inside,
+    }
+
+
+@contextmanager
+def _timed(seconds: dict[str, float], name: str) -> Iterator[None]:
+    start = time.perf_counter()
+    yield
+    seconds[name] = time.perf_counter() - start

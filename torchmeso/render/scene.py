@@ -1,0 +1,196 @@
+"""What is rendered: meshes with materials, lights, and the flat arrays a frame works on.
+
+Test: tests/render/test_scene.py
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchmeso.data.btf import Evaluable
+from torchmeso.errors import ConfigError, check_shape
+from torchmeso.geometry import frames
+from torchmeso.geometry.camera import Camera
+from torchmeso.geometry.frames import Frame
+from torchmeso.geometry.light import Light
+from torchmeso.geometry.mesh import Mesh
+from torchmeso.render.rasterize import Layers, barycentric
+
+
+@runtime_checkable
+class DistanceFunction(Protocol):
+    """Anything that says how deep the mesostructure lies: `data.Mdf`, or a ray caster standing in for it.
+
+    Attributes:
+        h: slab depth in tile units.
+        no_hit: None where every ray hits.
+        delta_max: largest drop, D cos(theta) / h.
+    """
+
+    h: float
+    no_hit: Tensor | None
+
+    @property
+    def delta_max(self) -> float:
+        """Largest drop."""
+        ...
+
+    def evaluate(self, uv: Float[Tensor, "n 2"], wo: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+        """Return D(uv, wo) in tile units; inf = no hit."""
+        ...
+
+    def distance(self, uv: Float[Tensor, "n 2"], wo: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+        """Return D(uv, wo) as well as is known, for the few rays whose answer decides a silhouette."""
+        ...
+
+    def depth(self, uv: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch"]:
+        """Return how deep the material lies straight below `uv`, in tile units; inf = a hole."""
+        ...
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Material:
+    """How a surface looks.
+
+    Attributes:
+        btf: reflectance with meso-scale detail, or None for a plain diffuse surface.
+        mdf: depth of the mesostructure, or None: no silhouette detail, and shadows fall on the mesh itself.
+        albedo: (3,) linear RGB of a plain surface; unused with a BTF.
+    """
+
+    btf: Evaluable | None = None
+    mdf: DistanceFunction | None = None
+    albedo: tuple[float, float, float] = (0.6, 0.6, 0.6)
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Object:
+    """A mesh with a material."""
+
+    mesh: Mesh
+    material: Material
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Scene:
+    """Objects and lights.
+
+    Attributes:
+        objects: at least one.
+        lights: any number.
+        ambient: radiance factor of the ambient term L_a.
+        ambient_rule: "add" adds ambient L_a to every pixel; "paper" shows it only where no light arrives
+            (wang2005mdf, section 4.2).
+        background: linear RGB where nothing is seen.
+    """
+
+    objects: tuple[Object, ...]
+    lights: tuple[Light, ...]
+    ambient: float = 0.05
+    ambient_rule: str = "add"
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        """Raise ConfigError for a scene no picture can be made of."""
+        if not self.objects:
+            raise ConfigError("scene: expected at least one object, got none")
+        if self.ambient_rule not in ("add", "paper"):
+            raise ConfigError(f"scene.ambient_rule: expected 'add' or 'paper', got '{self.ambient_rule}'")
+
+
+class World(NamedTuple):
+    """All meshes of a scene as one.
+
+    Attributes:
+        vertices: (V, 3).
+        faces: (F, 3).
+        uv: (V, 2).
+        normals: (V, 3).
+        tangents: (V, 3).
+        sign: (V,).
+        scale: (V,) texture scale.
+        component: (F,) component, numbered through all objects.
+        closed: (C,) whether a component is closed.
+        owner: (F,) object each face belongs to.
+    """
+
+    vertices: Float[Tensor, "V 3"]
+    faces: Int[Tensor, "F 3"]
+    uv: Float[Tensor, "V 2"]
+    normals: Float[Tensor, "V 3"]
+    tangents: Float[Tensor, "V 3"]
+    sign: Float[Tensor, "V"]
+    scale: Float[Tensor, "V"]
+    component: Int[Tensor, "F"]
+    closed: Bool[Tensor, "C"]
+    owner: Int[Tensor, "F"]
+
+
+class Points(NamedTuple):
+    """Surface points at fragments.
+
+    Attributes:
+        position: (n, 3) world, on the base surface.
+        uv: (n, 2).
+        frame: world tangent frame; each vector (n, 3).
+        scale: (n,) texture scale.
+        owner: (n,) object.
+    """
+
+    position: Float[Tensor, "n 3"]
+    uv: Float[Tensor, "n 2"]
+    frame: Frame
+    scale: Float[Tensor, "n"]
+    owner: Int[Tensor, "n"]
+
+    def select(self, which: Tensor) -> "Points":
+        """Return the points `which` (numbers or a mask)."""
+        frame = Frame(*(x[which] for x in self.frame))
+        return Points(self.position[which], self.uv[which], frame, self.scale[which], self.owner[which])
+
+
+def assemble(scene: Scene) -> World:
+    """Return the meshes of `scene` as one set of arrays."""
+    meshes = [o.mesh for o in scene.objects]
+    first_vertex, first_component, faces, component = 0, 0, [], []
+    for m in meshes:
+        faces.append(m.faces + first_vertex)
+        component.append(m.component + first_component)
+        first_vertex += len(m.vertices)
+        first_component += len(m.closed)
+    owner = torch.cat([torch.full((len(m.faces),), i) for i, m in enumerate(meshes)])
+
+    def join(name: str) -> Tensor:
+        return torch.cat([getattr(m, name) for m in meshes])
+
+    return World(
+        join("vertices"), torch.cat(faces), join("uv"), join("normals"), join("tangents"), join("sign"), join("scale"),
+        torch.cat(component), join("closed"), owner,
+    )  # fmt: skip
+
+
+def interpolate(world: World, layers: Layers, camera: Camera, which: Int[Tensor, "n"]) -> Points:
+    """Return the surface points at the fragments `which`, perspective-correct."""
+    check_shape("which", which, (-1,))
+    face = layers.triangles.face[layers.triangle[which]]
+    weight = barycentric(layers, camera, which).unsqueeze(-1)
+    corner = world.faces[face]
+
+    def mean(values: Tensor) -> Tensor:
+        return (values[corner] * weight).sum(1)
+
+    origin, direction, _ = rays(camera, layers.pixel[which])
+    position = origin + layers.t[which, None] * direction
+    frame = frames.orthonormal(mean(world.normals), mean(world.tangents), world.sign[corner[:, 0]])
+    return Points(position, mean(world.uv), frame, mean(world.scale[:, None])[:, 0], world.owner[face])
+
+
+def rays(
+    camera: Camera, pixel: Int[Tensor, "n"]
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"], Float[Tensor, "n"]]:
+    """Return origin, unit direction and stretch of the rays through the centres of `pixel`."""
+    xy = torch.stack([pixel % camera.width, pixel // camera.width], -1).float() + 0.5
+    return camera.rays(xy)

@@ -1,0 +1,151 @@
+"""Shadow maps that know the mesostructure, for directional, spot and point lights.
+
+wang2005mdf, section 4.2. The map is a picture of the scene from the light, silhouettes included. Because the BTF
+already holds the shadows of its own mesostructure, a blocker counts from the base of the slab:
+
+    depth = min(t_f + s_f h / cos(theta_l), t_b)         closed surfaces
+    depth = t_f + s_f h / cos(theta_l)                   open ones (from behind, and plain ones: t_f)
+
+To that comes a bias against self-shadowing that grows with the slope seen from the light, but for closed surfaces
+it never goes past the middle between the blocker and its own back: whatever a body rests on is still in its shadow.
+A texel keeps its triangle, so the depth is taken where the receiver's own light ray meets the triangle's plane, not
+at the texel's centre.
+
+Test: tests/render/test_shadow_map.py
+"""
+
+import math
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchmeso.data.mdf import MIN_COS
+from torchmeso.geometry import frames
+from torchmeso.geometry.camera import Camera
+from torchmeso.geometry.directions import dot
+from torchmeso.geometry.light import DirectionalLight, Light, SpotLight
+from torchmeso.render.rasterize import Triangles, depth_at, rasterize
+from torchmeso.render.scene import Scene, World, interpolate, rays
+from torchmeso.render.silhouette import Candidates, Silhouette, find_candidates, nearest
+
+
+class ShadowMap(NamedTuple):
+    """What one light sees, in one to six square pictures.
+
+    Attributes:
+        faces: the pictures; six for a point light.
+    """
+
+    faces: "tuple[ShadowFace, ...]"
+
+
+class ShadowFace(NamedTuple):
+    """One picture from a light.
+
+    Attributes:
+        camera: the view.
+        triangle: (pixels,) row of `triangles` of the blocker nearest to the light, -1 = none.
+        behind: (pixels,) distance from that triangle's plane to where the shadow starts.
+        triangles: what was drawn.
+    """
+
+    camera: Camera
+    triangle: Tensor
+    behind: Tensor
+    triangles: Triangles
+
+
+SLOPE_BIAS, STEEPEST = 2.0, 0.03
+"""Bias in texels per texel of depth that the blocker falls by across one; cosines are taken no smaller than this."""
+
+
+def build(scene: Scene, world: World, light: Light, *, size: int, silhouette: Silhouette) -> ShadowMap:
+    """Return the shadow map of `light`: size x size texels (half of that for each face of a point light)."""
+    return ShadowMap(tuple(_draw(scene, world, camera, silhouette) for camera in _cameras(world, light, size)))
+
+
+def blocked(shadow: ShadowMap, position: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
+    """Return whether the light is blocked at world positions; positions outside the map are lit."""
+    result = torch.zeros(len(position), dtype=torch.bool)
+    for face in shadow.faces:
+        camera = face.camera
+        x_w, y_w, w, depth = camera.project(position).unbind(-1)
+        ahead = depth > camera.near
+        xy = torch.stack([x_w, y_w], -1) / torch.where(ahead, w, 1).unsqueeze(-1)
+        column, row = xy.floor().long().unbind(-1)
+        inside = ahead & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        inside = inside.nonzero()[:, 0]
+        triangle = face.triangle[row[inside] * camera.width + column[inside]]
+        seen, triangle = inside[triangle >= 0], triangle[triangle >= 0]
+        perspective = camera.projection == "perspective"
+        t = (position[seen] - camera.eye.to(position.dtype)).norm(dim=-1) if perspective else depth[seen]
+        start = depth_at(face.triangles, camera, triangle, xy[seen])
+        start = start + face.behind[row[seen] * camera.width + column[seen]]
+        result[seen] |= t > start
+    return result
+
+
+def _draw(scene: Scene, world: World, camera: Camera, silhouette: Silhouette) -> ShadowFace:
+    """Render the scene from the light and keep the nearest shadow start of each texel."""
+    layers = rasterize(camera, world.vertices, world.faces)
+    candidates, _ = find_candidates(scene, world, camera, layers, silhouette, depths=False)
+    blockers = (candidates.fragment >= 0).nonzero()[:, 0]  # a light inside a solid lights that solid's surroundings
+    candidates = Candidates(*(x[blockers] for x in candidates))
+    points = interpolate(world, layers, camera, candidates.fragment)
+    cosine = dot(points.frame.n, -rays(camera, candidates.pixel)[1])
+    h = torch.tensor([0.0 if o.material.mdf is None else o.material.mdf.h for o in scene.objects])[points.owner]
+    front = layers.triangles.front[layers.triangle[candidates.fragment]]
+    textured = front & (h > 0) & (silhouette != "none")
+    thickness = candidates.t_back - candidates.t
+    below = torch.where(textured, points.scale * h / cosine.clamp(min=MIN_COS), 0).minimum(thickness)
+    texel = torch.full_like(cosine, camera.pixel_size)
+    if camera.projection == "perspective":
+        texel = texel * candidates.t
+    steep = cosine.abs().clamp(min=STEEPEST)
+    bias = texel * (1 + SLOPE_BIAS * (1 - steep.square()).clamp(min=0).sqrt() / steep)
+    # Below a mesostructure a receiver may lie a little deeper than the back of a thin rim: one texel is left there.
+    room = ((thickness - below) / 2).clamp(min=0)
+    behind = below + torch.minimum(bias, torch.where(textured, torch.maximum(room, texel), room))
+    first = nearest(candidates, candidates.t + behind)
+    n_pixel = camera.width * camera.height
+    triangle, offset = torch.full((n_pixel,), -1), torch.zeros(n_pixel)
+    triangle[candidates.pixel[first]] = layers.triangle[candidates.fragment[first]]
+    offset[candidates.pixel[first]] = behind[first]
+    return ShadowFace(camera, triangle, offset, layers.triangles)
+
+
+def _cameras(world: World, light: Light, size: int) -> list[Camera]:
+    """Return the views from a light: one around all of the scene, one along a cone, or six faces of a cube."""
+    corners = world.vertices.double()
+    if isinstance(light, DirectionalLight):
+        frame = frames.around(light.direction.double())
+        axes = torch.stack([frame.t, frame.b, frame.n])
+        local = corners @ axes.T
+        low, high = local.amin(0), local.amax(0)
+        extent = float((high - low).max()) * (1 + 4 / size) + 1e-9
+        eye = ((low + high) / 2) @ axes + axes[2] * extent
+        return [
+            Camera(eye=eye, axes=axes, projection="orthographic", view_height=extent, width=size, height=size,
+                   near=extent * 1e-3)
+        ]  # fmt: skip
+    eye = light.position.double()
+    near = max(1e-4 * float((corners - eye).norm(dim=-1).max()), 1e-9)
+    if isinstance(light, SpotLight):
+        frame = frames.around(-light.axis.double())
+        axes = torch.stack([frame.t, frame.b, frame.n])
+        # A texel more on every side, so that the rim of the cone is covered.
+        fov = 2 * math.degrees(math.atan(math.tan(math.radians(light.outer_deg)) * (1 + 4 / size)))
+        return [Camera(eye=eye, axes=axes, fov_deg=fov, width=size, height=size, near=near)]
+    side = max(size // 2, 1)
+    fov = 2 * math.degrees(math.atan(1 + 2 / side))
+    cube = []
+    for axis in range(3):
+        for sign in (1.0, -1.0):
+            back = torch.zeros(3, dtype=torch.float64)
+            back[axis] = sign
+            frame = frames.around(back)
+            axes = torch.stack([frame.t, frame.b, frame.n])
+            cube.append(Camera(eye=eye, axes=axes, fov_deg=fov, width=side, height=side, near=near))
+    return cube
