@@ -1,10 +1,30 @@
 import json
+import os
+import subprocess
+import sys
+import time
 
 import pytest
+import torch
+import yaml
 from click.testing import CliRunner
 
+from tests.pipeline.small import CONTENT
 from torchmeso.backends import opencl
 from torchmeso.cli import main
+from torchmeso.data import image, mdf
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("TORCHMESO_CACHE", str(tmp_path / "cache"))
+
+
+@pytest.fixture
+def small(tmp_path):
+    path = tmp_path / "small.yaml"
+    path.write_text(yaml.safe_dump(CONTENT))
+    return path
 
 
 def run(*arguments):
@@ -25,11 +45,101 @@ def test_info_without_a_platform_says_what_to_do(monkeypatch):
     assert "no OpenCL platform: everything runs on torch" in result.stdout
 
 
+def test_info_on_a_file(small):
+    assert "objects: torus (brick), plane (clay)" in run("info", small).stdout
+    assert json.loads(run("info", small, "--json").stdout)["picture"] == "48 x 36"
+
+
+def test_from_a_mesostructure_to_a_model(tmp_path):
+    btf_path, mdf_path, model = tmp_path / "a.btf.zarr", tmp_path / "a.mdf.zarr", tmp_path / "a.meso"
+    grid = "grid(4, 2, 80)"
+    result = run("bake", "--meso", "brick", "--out", btf_path, "--texels", 8, "--lights", grid, "--views", grid)
+    assert result.stdout.strip() == str(btf_path)
+    assert run("bake", "--meso", "brick", "--out", mdf_path, "--texels", 16).exit_code == 0
+    assert mdf.load(mdf_path).texels == (16, 16)
+    assert run("compress", btf_path, "--rank", 3, "--mdf", mdf_path, "--out", model).exit_code == 0
+    assert "rank: 3" in run("info", model).stdout
+
+
+def test_render_and_compare(small, tmp_path):
+    result = run("render", small, "--out", tmp_path / "a.exr", "--json")
+    assert json.loads(result.stdout)["counts"]["pixels"] == 48 * 36
+    assert run("render", small, "--out", tmp_path / "b.png", "--silhouette", "none").exit_code == 0
+    assert run("render", small, "--out", tmp_path / "t.exr", "--truth").exit_code == 0
+    result = run("compare", tmp_path / "t.exr", tmp_path / "a.exr", "--out", tmp_path / "d.png", "--json")
+    assert json.loads(result.stdout)["psnr"] > 10
+    assert image.read(tmp_path / "d.png").shape == (36, 48, 3)
+    assert "PSNR inf dB" in run("compare", tmp_path / "a.exr", tmp_path / "a.exr").stdout
+
+
+def test_bake_every_material(small, tmp_path):
+    content = yaml.safe_load(small.read_text())
+    del content["materials"]["unused"]
+    small.write_text(yaml.safe_dump(content))
+    result = run("bake", small, "--out", tmp_path / "tables")
+    assert [line.rpartition("/")[2] for line in result.stdout.split()] == ["brick.btf.zarr", "brick.mdf.zarr"]
+
+
+REFUSED = [
+    (["info"], "give a FILE or --device"),
+    (["info", "none.meso"], " info: error: none.meso: expected a file, found none"),
+    (["bake"], "give a CONFIGURATION or --meso"),
+    (["bake", "--meso", "brick"], "--meso needs --out"),
+    (["bake", "--meso", "brik", "--out", "x.btf.zarr"], "got 'brik'; did you mean 'brick'?"),
+    (["bake", "--meso", "brick", "--out", "x.btf"], "expected a name that ends in .btf.zarr or .mdf.zarr"),
+    (["bake", "--meso", "brick", "--out", "x.mdf.zarr", "--samples", "4"], "an MDF has no --samples"),
+    (["bake", "--meso", "brick", "--out", "x.btf.zarr", "--texels", "999999"], "the limit is 64.0 GiB; lower"),
+    (["bake", "--meso", "brick", "--out", "x.btf.zarr", "--lights", "grid(1)"], "expected 'grid(n_phi, n_theta"),
+    (["compress", "none.btf.zarr", "--out", "x.meso"], "expected a btf table, found none; bake it first"),
+    (["compress", "none.btf.zarr", "--out", "x.zip"], "expected a name that ends in .meso"),
+    (["render", "none.yaml", "--out", "x.png"], "expected a configuration (.yaml), found none"),
+    (["render", "small.yaml", "--out", "x.gif"], "expected a name that ends in .png or .exr"),
+    (["render", "small.yaml", "--out", "small.yaml.png"], "exists already; give --force"),
+    (["compare", "none.png", "none.png"], "expected a picture, found none"),
+]
+
+
 @pytest.mark.errors
-def test_info_wants_a_file_or_a_device():
-    result = run("info")
+@pytest.mark.parametrize(("arguments", "message"), REFUSED, ids=range(len(REFUSED)))
+def test_bad_input_is_one_sentence_and_status_2(arguments, message, small, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "small.yaml.png").write_bytes(b"x")
+    before = sorted(tmp_path.rglob("*"))
+    result = run(*arguments)
     assert result.exit_code == 2
-    assert "give a FILE or --device" in result.stderr
+    assert message in result.stderr
+    assert "Traceback" not in result.stderr
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.errors
+def test_debug_keeps_the_traceback():
+    result = run("--debug", "info", "none.meso")
+    assert result.exception is not None
+    assert result.exit_code == 1
+
+
+def test_stopped_bake_leaves_nothing_half_written_and_goes_on(tmp_path):
+    """SIGINT in the middle: status 130, no table; the same command then finishes it."""
+    out = tmp_path / "a.btf.zarr"
+    command = [sys.executable, "-m", "torchmeso", "bake", "--meso", "brick", "--out", str(out), "--texels", "24"]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=os.environ.copy())
+    part = out.with_name(out.name + ".part") / "done"
+    for _ in range(600):
+        if part.is_dir() and len(list(part.iterdir())) >= 2:
+            break
+        time.sleep(0.05)
+    process.send_signal(2)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "stopped; run it again to go on" in said
+    assert not out.exists()
+    done = len(list(part.iterdir()))
+    assert done >= 2
+    assert subprocess.run(
+        [*command, "--samples", "4"], check=True, capture_output=True, text=True
+    ).stdout.strip() == str(out)
+    assert not part.exists()
 
 
 def test_every_command_has_help():
@@ -37,3 +147,13 @@ def test_every_command_has_help():
         result = run(name, "--help")
         assert result.exit_code == 0, name
         assert "Usage:" in result.stdout
+
+
+def test_importing_the_command_line_is_cheap():
+    code = "import sys, torchmeso.cli; print('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "False"
+
+
+def test_png_keeps_colours(tmp_path):
+    image.write_png(tmp_path / "a.png", torch.full((2, 2, 3), 0.5))
+    assert "largest value: 0.5" in run("info", tmp_path / "a.png").stdout

@@ -8,17 +8,21 @@ Test: tests/test_cli.py
 
 import json
 import sys
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import click
 
-from torchmeso.errors import MesoError
+from torchmeso.errors import ConfigError, MesoError
 
 
 class _Group(click.Group):
     """A click group that prints our errors as one sentence and leaves with status 2."""
 
     def invoke(self, ctx: click.Context) -> Any:
+        warnings.showwarning = _say
         try:
             return super().invoke(ctx)
         except MesoError as error:
@@ -26,6 +30,14 @@ class _Group(click.Group):
                 raise
             click.echo(f"{ctx.info_name} {ctx.invoked_subcommand}: error: {error}", err=True)
             ctx.exit(2)
+        except KeyboardInterrupt:
+            click.echo(f"{ctx.info_name} {ctx.invoked_subcommand}: stopped; run it again to go on", err=True)
+            ctx.exit(130)
+
+
+def _say(message: Warning | str, *_: Any) -> None:
+    """Print a warning as one line on stderr."""
+    click.echo(f"torchmeso: warning: {message}", err=True)
 
 
 @click.group(cls=_Group, context_settings={"help_option_names": ["-h", "--help"]})
@@ -33,6 +45,167 @@ class _Group(click.Group):
 @click.version_option(package_name="torchmeso")
 def main(debug: bool) -> None:
     """Meso-scale appearance on a CPU, from a mesostructure to a picture with its silhouette and its shadow."""
+
+
+@main.command()
+@click.option("--out", default="out", show_default=True, type=click.Path(), help="Folder for the results.")
+def demo(out: str) -> None:
+    """Built-in scene, start to picture: bake, compress, render, truth, report."""
+    from torchmeso import config
+    from torchmeso.pipeline import demo as job
+
+    with _progress() as report:
+        paths = job.run(config.load(job.built_in("demo")), out, report)
+    for path in paths:
+        click.echo(path)
+
+
+@main.command()
+@click.argument("configuration", required=False)
+@click.option("--meso", help="Mesostructure to bake alone: sheet, groove, spheres, brick, weave.")
+@click.option("--out", help="With --meso the table (.btf.zarr or .mdf.zarr), else a folder; none = the cache.")
+@click.option("--texels", type=int, help="Side of the texture (default 64 for a BTF, 256 for an MDF).")
+@click.option("--lights", help="Light directions of a BTF [grid(12, 5, 80)].")
+@click.option("--views", help="View directions [grid(12, 5, 80); MDF: grid(15, 10, 87.5)].")
+@click.option("--samples", type=int, help="Rays per texel and view of a BTF [4].")
+@click.option("--bounces", type=int, help="Reflections followed by a BTF; 0 = direct light only [2].")
+@click.option("--force", is_flag=True, help="Replace a finished table.")
+def bake(configuration: str | None, meso: str | None, out: str | None, force: bool, **options: Any) -> None:
+    """Bake BTF and MDF tables: of every material in CONFIGURATION, or of one mesostructure (--meso)."""
+    from pathlib import Path
+
+    if (configuration is None) == (meso is None):
+        raise click.UsageError("give a CONFIGURATION or --meso")
+    if configuration is not None:
+        _bake_all(configuration, None if out is None else Path(out), force)
+        return
+    if out is None:
+        raise click.UsageError("--meso needs --out, a name that ends in .btf.zarr or .mdf.zarr")
+    assert meso is not None
+    _bake_one(meso, Path(out), force, {k: v for k, v in options.items() if v is not None})
+
+
+def _bake_all(configuration: str, out: Any, force: bool) -> None:
+    from torchmeso import config
+    from torchmeso.pipeline import bake as job
+
+    settings = config.load(configuration)
+    with _progress() as report:
+        baked = [
+            job.bake_tables(name, material, report, {}, out=out, force=force)
+            for name, material in settings.materials.items()
+            if material.meso is not None
+        ]
+    for pair in baked:
+        for path in pair:
+            click.echo(path)
+
+
+def _bake_one(meso: str, out: Any, force: bool, options: dict[str, Any]) -> None:
+    from torchmeso import config
+    from torchmeso.meso import bake_btf, bake_mdf
+    from torchmeso.meso.bake_btf import BtfOptions
+    from torchmeso.meso.bake_mdf import MdfOptions
+
+    tile = config.build_meso({"type": meso})
+    about: dict[str, object] = {"source": {"type": meso}}
+    _refuse_to_replace(out, force)
+    with _progress() as report:
+        if out.name.endswith(".btf.zarr"):
+            bake_btf.bake(tile, BtfOptions(**options), out, about=about, progress=lambda x: report(f"{meso}: BTF", x))
+        elif out.name.endswith(".mdf.zarr"):
+            wrong = set(options) - {"texels", "views"}
+            if wrong:
+                raise ConfigError(f"bake: an MDF has no --{min(wrong)}; its dials are --texels and --views")
+            bake_mdf.bake(tile, MdfOptions(**options), out, about=about, progress=lambda x: report(f"{meso}: MDF", x))
+        else:
+            raise ConfigError(f"{out}: expected a name that ends in .btf.zarr or .mdf.zarr")
+    click.echo(out)
+
+
+@main.command()
+@click.argument("table")
+@click.option("--method", default="eigen", type=click.Choice(["eigen"]), show_default=True, help="Kind of model.")
+@click.option("--rank", default=4, show_default=True, help="Components kept, at most the number of views.")
+@click.option(
+    "--storage", default="uint8", show_default=True, type=click.Choice(["uint8", "float16", "float32"]), help="Of maps."
+)
+@click.option("--mdf", "silhouette", help="MDF table (.mdf.zarr) to pack into the model.")
+@click.option("--out", required=True, help="The run-time model (.meso).")
+@click.option("--force", is_flag=True, help="Replace an existing model.")
+def compress(table: str, method: str, rank: int, storage: Any, silhouette: str | None, out: str, force: bool) -> None:
+    """Compress a BTF TABLE (.btf.zarr) into a run-time model."""
+    from torchmeso.compress import eigen
+    from torchmeso.data import btf, eigen_btf, mdf
+
+    if not out.endswith(".meso"):
+        raise ConfigError(f"{out}: expected a name that ends in .meso")
+    _refuse_to_replace(out, force)
+    depth = None if silhouette is None else mdf.load(silhouette)
+    options = eigen.EigenOptions(rank=rank, storage=storage)
+    with _progress() as report:
+        model = eigen.fit(btf.load(table), options, progress=lambda x: report(f"{method} BTF", x))
+    eigen_btf.save(model, out, silhouette=depth)
+    click.echo(out)
+
+
+@main.command()
+@click.argument("configuration")
+@click.option("--silhouette", type=click.Choice(["none", "paper", "curved"]), help="Overrides the configuration.")
+@click.option("--out", required=True, help="Picture: .png (sRGB) or .exr (linear, with depth).")
+@click.option("--truth", is_flag=True, help="Ray-trace the displaced mesh instead: the ground truth.")
+@click.option("--force", is_flag=True, help="Replace an existing picture.")
+@click.option("--json", "as_json", is_flag=True, help="Print counts and times as JSON.")
+def render(configuration: str, silhouette: Any, out: str, truth: bool, force: bool, as_json: bool) -> None:
+    """Render CONFIGURATION (.yaml); bakes what is not in the cache."""
+    from torchmeso import config
+    from torchmeso.data import image
+    from torchmeso.pipeline import render as job
+    from torchmeso.pipeline import truth as truths
+    from torchmeso.render import film
+
+    settings = config.load(configuration)
+    if not out.lower().endswith((".png", ".exr")):
+        raise ConfigError(f"{out}: expected a name that ends in .png or .exr")
+    _refuse_to_replace(out, force)
+    if silhouette is not None:
+        settings = config.with_silhouette(settings, silhouette)
+    with _progress() as report:
+        if truth:
+            found = truths.render(settings, report)
+            if out.lower().endswith(".png"):
+                image.write_png(out, found.rgb)
+            else:
+                image.write_exr(out, found.rgb, Z=found.depth)
+            about: dict[str, Any] = {"path": out}
+        else:
+            picture = job.render(settings, report).picture
+            film.write(picture, out)
+            about = {"path": out, "counts": picture.counts, "seconds": picture.seconds}
+    click.echo(json.dumps(about) if as_json else out)
+
+
+@main.command()
+@click.argument("a")
+@click.argument("b")
+@click.option("--out", help="Picture of the difference (.png): four times the absolute difference.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON for machines.")
+def compare(a: str, b: str, out: str | None, as_json: bool) -> None:
+    """Compare picture B with its reference A: PSNR, SSIM, FLIP, largest error."""
+    from dataclasses import asdict
+
+    from torchmeso import quality
+    from torchmeso.data import image
+
+    reference, picture = image.read(a), image.read(b)
+    found = quality.compare(reference, picture)
+    if out is not None:
+        image.write_png(out, image.to_linear(quality.difference(reference, picture)))
+    if as_json:
+        click.echo(json.dumps(asdict(found)))
+        return
+    flip = "flip not installed" if found.flip is None else f"FLIP {found.flip:.4f}"
+    click.echo(f"PSNR {found.psnr:.2f} dB  SSIM {found.ssim:.4f}  {flip}  max error {found.max_error:.4g}")
 
 
 @main.command()
@@ -45,6 +218,37 @@ def info(file: str | None, device: bool, as_json: bool) -> None:
         raise click.UsageError("give a FILE or --device")
     if device:
         _info_device(as_json)
+    else:
+        from torchmeso.pipeline import describe
+
+        about = describe.file(str(file))
+        click.echo(json.dumps(about) if as_json else "\n".join(f"{k}: {v}" for k, v in about.items()))
+
+
+def _refuse_to_replace(path: Any, force: bool) -> None:
+    from pathlib import Path
+
+    if Path(path).exists() and not force:
+        raise ConfigError(f"{path}: exists already; give --force to replace it")
+
+
+@contextmanager
+def _progress() -> Iterator[Any]:
+    """Yield a report function that draws progress bars on stderr; quiet when stderr is no terminal."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn()
+    console = Console(stderr=True)
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bars:
+        tasks: dict[str, Any] = {}
+
+        def report(what: str, share: float) -> None:
+            if what not in tasks:
+                tasks[what] = bars.add_task(what, total=1.0)
+            bars.update(tasks[what], completed=share)
+
+        yield report
 
 
 def _info_device(as_json: bool) -> None:

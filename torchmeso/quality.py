@@ -73,6 +73,12 @@ def to_screen(linear: Float[Tensor, "*batch H W 3"], exposure: float) -> Float[T
     return linear_rgb_to_rgb(shown.movedim(-1, -3)).movedim(-3, -1)
 
 
+def difference(reference: Float[Tensor, "H W 3"], picture: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
+    """Return four times the absolute difference on the screen (sRGB values in [0, 1]), for looking at."""
+    exposure = find_exposure(reference)
+    return (4 * (to_screen(reference, exposure) - to_screen(picture, exposure)).abs()).clamp(max=1)
+
+
 def psnr(reference: Float[Tensor, "*batch"], picture: Float[Tensor, "*batch"]) -> float:
     """Return the peak signal-to-noise ratio in dB of values with peak 1; inf where they are equal."""
     error = float((reference.double() - picture.double()).square().mean())

@@ -59,10 +59,10 @@ class Mdf:
         """Height and width of the texture."""
         return self.delta.shape[1], self.delta.shape[2]
 
-    @cached_property
+    @property
     def delta_max(self) -> float:
         """Largest drop of the table, for the bound that lets thick intervals pass without a look-up."""
-        return float(self.delta.max()) / (255 if self.delta.dtype == torch.uint8 else 1)
+        return self._delta_max
 
     def evaluate(self, uv: Float[Tensor, "*batch 2"], wo: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         """Return D(uv, wo) in tile units; +inf where most of the footprint has no hit.
@@ -112,6 +112,10 @@ class Mdf:
     def depth(self, uv: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch"]:
         """Return the depth of the relief straight below `uv`, in tile units; inf in holes."""
         return self.relief.depth(uv)
+
+    @cached_property
+    def _delta_max(self) -> float:
+        return float(self.delta.max()) / (255 if self.delta.dtype == torch.uint8 else 1)
 
     @cached_property
     def _nodes(self) -> tuple[Tensor, Tensor | None]:

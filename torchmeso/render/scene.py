@@ -24,19 +24,16 @@ from torchmeso.render.rasterize import Layers, barycentric
 class DistanceFunction(Protocol):
     """Anything that says how deep the mesostructure lies: `data.Mdf`, or a ray caster standing in for it.
 
-    Attributes:
-        h: slab depth in tile units.
-        no_hit: None where every ray hits.
-        delta_max: largest drop, D cos(theta) / h.
+    `h` is the slab depth in tile units, `no_hit` None where every ray hits, `delta_max` the largest drop
+    D cos(theta) / h.
     """
 
-    h: float
-    no_hit: Tensor | None
-
     @property
-    def delta_max(self) -> float:
-        """Largest drop."""
-        ...
+    def h(self) -> float: ...  # noqa: D102
+    @property
+    def no_hit(self) -> Tensor | None: ...  # noqa: D102
+    @property
+    def delta_max(self) -> float: ...  # noqa: D102
 
     def evaluate(self, uv: Float[Tensor, "n 2"], wo: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
         """Return D(uv, wo) in tile units; inf = no hit."""

@@ -1,0 +1,87 @@
+from dataclasses import replace
+
+import pytest
+import torch
+
+from tests.pipeline.small import small
+from torchmeso.errors import ConfigError, FormatError
+from torchmeso.pipeline import bake
+
+
+def test_bakes_what_is_used_and_nothing_else(cache):
+    said = []
+    assets = bake.prepare(small(), lambda what, share: said.append(what))
+    assert set(assets) == {"brick", "clay"}
+    assert {"brick: MDF", "brick: BTF", "brick: eigen BTF"} == set(said)
+    brick = assets["brick"]
+    assert brick.material.mdf is not None
+    assert brick.model_bytes > 0
+    assert brick.raw_bytes > 0
+    assert set(brick.seconds) == {"mdf", "btf", "compress"}
+    assert assets["clay"].material.albedo == (0.5, 0.5, 0.5)
+    assert len(list(cache.glob("*.meso"))) == 1
+
+
+def test_second_time_comes_from_the_cache():
+    first = bake.prepare(small())["brick"]
+    said = []
+    second = bake.prepare(small(), lambda what, share: said.append(what))["brick"]
+    assert not said
+    assert not second.seconds
+    uv, w = torch.rand(5, 2), torch.tensor([[0.0, 0, 1]]).expand(5, 3)
+    assert torch.equal(first.material.btf.evaluate(uv, w, w), second.material.btf.evaluate(uv, w, w))
+
+
+def test_another_option_is_another_entry():
+    brick = small().materials["brick"]
+    paths = bake.table_paths(brick)
+    finer = brick.model_copy(update={"mdf": replace(brick.mdf, texels=32)})
+    assert bake.table_paths(finer)[0] == paths[0]
+    assert bake.table_paths(finer)[1] != paths[1]
+    more = brick.model_copy(update={"eigen": replace(brick.eigen, rank=3)})
+    assert bake.table_paths(more) == paths
+    assert bake.model_path(more) != bake.model_path(brick)
+
+
+def test_content_of_files_counts(tmp_path):
+    from torchmeso.config import MesoConfig
+    from torchmeso.data import image
+
+    image.write_png(tmp_path / "d.png", torch.rand(4, 4, 3))
+    meso = MesoConfig.model_validate({"type": "pictures", "displacement": str(tmp_path / "d.png"), "h": 0.1})
+    before = bake.describe_meso(meso)
+    assert before == bake.describe_meso(meso)
+    image.write_png(tmp_path / "d.png", torch.rand(4, 4, 3))
+    assert bake.describe_meso(meso) != before
+
+
+def test_finished_model_is_opened():
+    bake.prepare(small())
+    model = bake.model_path(small().materials["brick"])
+    content = {"brick": {"model": str(model)}, "clay": {"albedo": [1, 1, 1]}}
+    asset = bake.prepare(small(materials=content))["brick"]
+    assert asset.material.mdf is not None
+    assert asset.model_bytes == model.stat().st_size
+
+
+def test_tables_in_a_folder_of_ones_own(tmp_path):
+    brick = small().materials["brick"]
+    paths = bake.bake_tables("brick", brick, bake.silent, {}, out=tmp_path / "t")
+    assert [p.name for p in paths] == ["brick.btf.zarr", "brick.mdf.zarr"]
+    seconds = {}
+    assert bake.bake_tables("brick", brick, bake.silent, seconds, out=tmp_path / "t") == paths
+    assert not seconds
+
+
+@pytest.mark.errors
+def test_refusals(tmp_path):
+    brick = small().materials["brick"]
+    bake.bake_tables("brick", brick, bake.silent, {}, out=tmp_path)
+    other = brick.model_copy(update={"mdf": replace(brick.mdf, texels=8)})
+    with pytest.raises(ConfigError, match="holds another table; give --force"):
+        bake.bake_tables("brick", other, bake.silent, {}, out=tmp_path)
+    bake.bake_tables("brick", other, bake.silent, {}, out=tmp_path, force=True)
+    with pytest.raises(ConfigError, match=r"materials\.clay: expected a mesostructure"):
+        bake.bake_tables("clay", small().materials["clay"], bake.silent, {})
+    with pytest.raises(FormatError, match="expected a file, found none"):
+        bake.file_hash(tmp_path / "none")

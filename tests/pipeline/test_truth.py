@@ -1,0 +1,71 @@
+import pytest
+import torch
+
+from tests.pipeline.small import small
+from torchmeso.errors import ConfigError
+from torchmeso.geometry.light import DirectionalLight
+from torchmeso.pipeline import truth
+from torchmeso.transport.tracer import MeshTracer
+
+CLAY = {"clay": {"albedo": [0.5, 0.25, 1.0]}}
+
+
+def test_lit_plane_has_its_closed_form():
+    """A diffuser without bounces: albedo (cos + ambient), nothing else."""
+    settings = small(
+        materials=CLAY, objects=[{"shape": "plane", "options": {"size": [20, 20]}, "material": "clay"}],
+        lights=[{"type": "directional", "direction": [0, 3, 4]}], ambient=0.1, truth={"samples": 64, "bounces": 0},
+        camera={"eye": [0, 4, 1], "width": 16, "height": 16},
+    )  # fmt: skip
+    found = truth.render(settings)
+    assert (found.owner == 0).all()
+    expected = torch.tensor([0.5, 0.25, 1.0]) * (0.6 + 0.1)
+    torch.testing.assert_close(found.rgb, expected.expand(16, 16, 3), rtol=1e-3, atol=0)
+
+
+def test_owner_and_background():
+    found = truth.render(small(background=[0.1, 0.2, 0.3]))
+    assert set(found.owner.flatten().tolist()) == {-1, 0, 1}
+    assert torch.allclose(found.rgb[found.owner == -1], torch.tensor([0.1, 0.2, 0.3]))
+    assert (found.depth.isinf() == (found.owner == -1)).all()
+
+
+def test_kept_by_content(cache):
+    said = []
+    first = truth.render(small(), lambda what, share: said.append(what))
+    assert said
+    said.clear()
+    again = truth.render(small(name="other", render={"silhouette": "none"}), lambda what, share: said.append(what))
+    assert not said
+    assert torch.equal(first.rgb, again.rgb)
+    truth.render(small(ambient=0.5), lambda what, share: said.append(what))
+    assert said
+    assert len(list(cache.glob("*.truth"))) == 2
+
+
+def test_shadows_of_a_ball_on_a_floor():
+    settings = small(
+        materials=CLAY,
+        objects=[
+            {"shape": "sphere", "options": {"radius": 0.5}, "translate": [0, 1, 0], "material": "clay"},
+            {"shape": "plane", "options": {"size": [6, 6]}, "material": "clay"},
+        ],
+        camera={"eye": [0, 6, 0.01], "width": 64, "height": 64},
+    )  # fmt: skip
+    tracer, camera = MeshTracer(*truth.geometries(settings)), settings.camera.build()
+    light = DirectionalLight(direction=torch.tensor([0.6, 0.8, 0.0]), irradiance=torch.ones(3))
+    dark = truth.shadows(tracer, camera, light)
+    owner, depth, origin, direction = truth.first_hits(tracer, camera)
+    place = (origin + depth.flatten()[:, None] * direction).reshape(64, 64, 3)
+    # On the floor the shadow is an ellipse around (-0.75, 0), stretched by 1 / 0.8 along x.
+    inside = ((place[..., 0] + 0.75) * 0.8).square() + place[..., 2].square() < 0.25
+    floor = owner == 1
+    wrong = (dark != inside) & floor
+    assert wrong.sum() <= 0.02 * floor.sum()
+
+
+@pytest.mark.errors
+def test_a_finished_model_has_no_known_geometry(tmp_path):
+    settings = small(materials={**CLAY, "brick": {"model": str(tmp_path / "a.meso")}})
+    with pytest.raises(ConfigError, match="expected the mesostructure of 'brick', got a finished model"):
+        truth.geometries(settings)

@@ -1,0 +1,441 @@
+"""Configurations: a YAML file -> what every stage is asked to do.
+
+A file names materials (a mesostructure and how to bake and compress it, a finished model, or a plain colour),
+objects, lights, a camera and how to render. The stages' own options are used as they are; unknown keys are refused and
+the nearest known one is named. Paths that start with `data:` lie in TORCHMESO_DATA, others beside the file.
+
+Test: tests/test_config.py
+"""
+
+import inspect
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import torch
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator, validate_call
+
+from torchmeso.compress.eigen import EigenOptions
+from torchmeso.data import height_field
+from torchmeso.errors import ConfigError, FormatError, MesoError, did_you_mean
+from torchmeso.geometry.camera import Camera, look_at
+from torchmeso.geometry.light import DirectionalLight, Light, PointLight, SpotLight
+from torchmeso.geometry.shapes import SHAPES
+from torchmeso.meso import mesostructure
+from torchmeso.meso.bake_btf import BtfOptions
+from torchmeso.meso.bake_mdf import MdfOptions
+from torchmeso.meso.generators import GENERATORS
+from torchmeso.meso.mesostructure import Mesostructure, Rgb
+from torchmeso.render.frame import FrameOptions
+from torchmeso.render.silhouette import Silhouette
+
+Vector = tuple[float, float, float]
+
+
+class _Strict(BaseModel):
+    """Frozen, and nothing but the known keys."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
+
+
+def _from_pictures(
+    *,
+    displacement: str,
+    albedo: str | None = None,
+    h: float,
+    texels: int = 256,
+    roughness: float = 0.5,
+    f0: float = 0.0,
+    colour: Rgb | None = None,
+) -> Mesostructure:
+    """Height field from a displacement picture and a colour picture."""
+    field = height_field.from_pictures(displacement, albedo, h=h, texels=texels)
+    plain = colour or ((1.0, 1.0, 1.0) if albedo else (0.6, 0.6, 0.6))
+    return mesostructure.from_height_field(field, albedo=plain, roughness=roughness, f0=f0)
+
+
+def _from_scan(
+    *,
+    path: str,
+    relief: float | None = None,
+    texels: int = 256,
+    blend: float = 0.1,
+    colour: Rgb = (0.6, 0.6, 0.6),
+    roughness: float = 0.5,
+    f0: float = 0.0,
+) -> Mesostructure:
+    """Height field from a GelSight .tmd scan."""
+    field = height_field.from_tmd(path, relief=relief, texels=texels, blend=blend)
+    return mesostructure.from_height_field(field, albedo=colour, roughness=roughness, f0=f0)
+
+
+def _from_mesh(
+    *, path: str, h: float | None = None, colour: Rgb = (0.6, 0.6, 0.6), roughness: float = 0.5, f0: float = 0.0
+) -> Mesostructure:
+    """Any triangle tile that trimesh reads."""
+    return mesostructure.from_file(path, h=h, albedo=colour, roughness=roughness, f0=f0)
+
+
+SOURCES: dict[str, Callable[..., Mesostructure]] = {
+    **GENERATORS,
+    "pictures": _from_pictures,
+    "scan": _from_scan,
+    "mesh": _from_mesh,
+}
+"""What `meso.type` may be: the generators, and the readers of files."""
+
+
+class MesoConfig(BaseModel):
+    """A mesostructure: `type`, and the arguments of that generator or reader."""
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+
+    type: str
+
+    @model_validator(mode="after")
+    def _check(self) -> "MesoConfig":
+        if self.type not in SOURCES:
+            raise ValueError(f"expected a mesostructure, got '{self.type}'{did_you_mean(self.type, SOURCES)}")
+        parameters = inspect.signature(SOURCES[self.type]).parameters
+        for key in self.arguments:
+            if key not in parameters:
+                raise ValueError(f"{self.type} has no option '{key}'{did_you_mean(key, parameters)}")
+        for name, parameter in parameters.items():
+            if parameter.default is inspect.Parameter.empty and name not in self.arguments:
+                raise ValueError(f"{self.type} needs the option '{name}'")
+        return self
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """Options of the generator or reader."""
+        return dict(self.model_extra or {})
+
+    @property
+    def files(self) -> list[Path]:
+        """Files it is made from."""
+        return [Path(v) for k, v in self.arguments.items() if k in ("displacement", "albedo", "path") and _is_path(v)]
+
+    def build(self) -> Mesostructure:
+        """Return the mesostructure.
+
+        Raises:
+            MesoError: an argument is out of range, or a file is missing or unreadable.
+        """
+        try:
+            return validate_call(SOURCES[self.type])(**self.arguments)
+        except ValidationError as error:
+            raise ConfigError(f"meso.{_first_problem(error)}") from error
+
+
+class MaterialConfig(_Strict):
+    """A mesostructure with how to bake and compress it; or a finished model; or a plain colour."""
+
+    meso: MesoConfig | None = None
+    model: str | None = None
+    albedo: Rgb | None = None
+    btf: BtfOptions = Field(default_factory=BtfOptions)
+    mdf: MdfOptions = Field(default_factory=MdfOptions)
+    eigen: EigenOptions = Field(default_factory=EigenOptions)
+
+    @model_validator(mode="after")
+    def _check(self) -> "MaterialConfig":
+        if sum(x is not None for x in (self.meso, self.model, self.albedo)) != 1:
+            raise ValueError("expected exactly one of 'meso', 'model' (a .meso file) and 'albedo' (a plain colour)")
+        return self
+
+
+class ObjectConfig(_Strict):
+    """A built-in shape or a mesh file, its material, and where it stands."""
+
+    material: str
+    shape: str | None = None
+    mesh: str | None = None
+    options: dict[str, Any] = Field(default_factory=dict)
+    tiles: float | tuple[float, float] | None = None
+    unwrap: bool = False
+    tile_size: float | None = None
+    scale: float = 1.0
+    rotate_deg: Vector = (0.0, 0.0, 0.0)
+    translate: Vector = (0.0, 0.0, 0.0)
+
+    @model_validator(mode="after")
+    def _check(self) -> "ObjectConfig":
+        if (self.shape is None) == (self.mesh is None):
+            raise ValueError("expected exactly one of 'shape' and 'mesh'")
+        if self.shape is not None and self.shape not in SHAPES:
+            raise ValueError(f"expected a shape, got '{self.shape}'{did_you_mean(self.shape, SHAPES)}")
+        if self.shape is not None:
+            known = set(inspect.signature(SHAPES[self.shape]).parameters) - {"tiles"}
+            for key in self.options:
+                if key not in known:
+                    raise ValueError(f"{self.shape} has no option '{key}'{did_you_mean(key, known)}")
+        elif self.options:
+            raise ValueError("'options' belong to built-in shapes")
+        if self.unwrap and (self.mesh is None or self.tile_size is None):
+            raise ValueError("'unwrap' makes texture coordinates for a 'mesh' and needs 'tile_size' (world units)")
+        return self
+
+    def matrix(self) -> torch.Tensor:
+        """Return the 4 x 4 matrix: scale, then turns around x, y and z, then the translation."""
+        result = torch.eye(4, dtype=torch.float64) * self.scale
+        result[3, 3] = 1
+        for axis, angle in enumerate(self.rotate_deg):
+            a = torch.tensor(angle, dtype=torch.float64).deg2rad()
+            i, j = (axis + 1) % 3, (axis + 2) % 3
+            turn = torch.eye(4, dtype=torch.float64)
+            turn[i, i] = turn[j, j] = a.cos()
+            turn[j, i], turn[i, j] = a.sin(), -a.sin()
+            result = turn @ result
+        result[:3, 3] = torch.tensor(self.translate, dtype=torch.float64)
+        return result.float()
+
+
+class DirectionalConfig(_Strict):
+    """A distant light; `irradiance` at normal incidence."""
+
+    type: Literal["directional"]
+    direction: Vector
+    irradiance: Vector = (torch.pi, torch.pi, torch.pi)
+
+    def build(self) -> Light:
+        """Return the light."""
+        towards = torch.tensor(self.direction, dtype=torch.float32)
+        if float(towards.norm()) == 0:
+            raise ConfigError("lights.direction: expected a direction towards the light, got 0, 0, 0")
+        return DirectionalLight(direction=towards / towards.norm(), irradiance=torch.tensor(self.irradiance))
+
+
+class PointConfig(_Strict):
+    """A point light; E = intensity / r^2."""
+
+    type: Literal["point"]
+    position: Vector
+    intensity: Vector
+
+    def build(self) -> Light:
+        """Return the light."""
+        return PointLight(position=torch.tensor(self.position), intensity=torch.tensor(self.intensity))
+
+
+class SpotConfig(_Strict):
+    """A spot light at `position` that shines towards `at`."""
+
+    type: Literal["spot"]
+    position: Vector
+    at: Vector
+    intensity: Vector
+    inner_deg: float = 25.0
+    outer_deg: float = 30.0
+
+    def build(self) -> Light:
+        """Return the light."""
+        axis = torch.tensor(self.at, dtype=torch.float32) - torch.tensor(self.position)
+        if float(axis.norm()) == 0:
+            raise ConfigError("lights.at: expected another place than the light's position")
+        return SpotLight(
+            position=torch.tensor(self.position),
+            axis=axis / axis.norm(),
+            intensity=torch.tensor(self.intensity),
+            inner_deg=self.inner_deg,
+            outer_deg=self.outer_deg,
+        )
+
+
+LightConfig = Annotated[DirectionalConfig | PointConfig | SpotConfig, Field(discriminator="type")]
+
+
+class CameraConfig(_Strict):
+    """A camera at `eye` that looks at `at`."""
+
+    eye: Vector
+    at: Vector = (0.0, 0.0, 0.0)
+    up: Vector = (0.0, 1.0, 0.0)
+    projection: Literal["perspective", "orthographic"] = "perspective"
+    fov_deg: float = 45.0
+    view_height: float = 2.0
+    width: int = 800
+    height: int = 600
+    near: float = 1e-3
+
+    def build(self) -> Camera:
+        """Return the camera.
+
+        Raises:
+            ConfigError: it looks nowhere, or a value is out of range.
+        """
+        eye, at, up = (torch.tensor(x, dtype=torch.float64) for x in (self.eye, self.at, self.up))
+        place, axes = look_at(eye, at, up)
+        rest = self.model_dump(exclude={"eye", "at", "up"})
+        return Camera(eye=place, axes=axes, **rest)
+
+
+class TruthConfig(_Strict):
+    """How the ray-traced truth is made: paths per pixel, bounces, and the longest edge of displaced triangles."""
+
+    samples: int = Field(default=16, ge=1, le=4096)
+    bounces: int = Field(default=2, ge=0, le=64)
+    max_edge: float = Field(default=0.1, gt=0)
+
+
+class Config(_Strict):
+    """Everything a picture needs."""
+
+    name: str = "scene"
+    materials: dict[str, MaterialConfig]
+    objects: list[ObjectConfig] = Field(min_length=1)
+    lights: list[LightConfig] = Field(default_factory=list)
+    ambient: float = Field(default=0.05, ge=0)
+    ambient_rule: Literal["add", "paper"] = "add"
+    background: Vector = (0.0, 0.0, 0.0)
+    camera: CameraConfig
+    render: FrameOptions = Field(default_factory=FrameOptions)
+    truth: TruthConfig = Field(default_factory=TruthConfig)
+
+    @model_validator(mode="after")
+    def _check(self) -> "Config":
+        for item in self.objects:
+            if item.material not in self.materials:
+                raise ValueError(
+                    f"objects: no material is called '{item.material}'{did_you_mean(item.material, self.materials)}"
+                )
+        return self
+
+
+def load(path: str | Path) -> Config:
+    """Return the configuration in the YAML file `path`.
+
+    Raises:
+        FormatError: the file is missing or no YAML.
+        ConfigError: a key is unknown, or a value is of the wrong kind or out of range.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FormatError(f"{path}: expected a configuration (.yaml), found none; check the path")
+    try:
+        content = yaml.safe_load(path.read_text())
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise FormatError(f"{path}: expected YAML ({' '.join(str(error).split())})") from error
+    if not isinstance(content, dict):
+        raise FormatError(f"{path}: expected keys and values, got {type(content).__name__}")
+    return parse(content, folder=path.parent, name=str(path))
+
+
+def parse(content: dict[str, Any], *, folder: Path, name: str = "config") -> Config:
+    """Return the configuration in `content`; relative paths lie in `folder`.
+
+    Raises:
+        ConfigError: a key is unknown, or a value is of the wrong kind or out of range.
+    """
+    try:
+        return Config.model_validate(_resolve(content, folder))
+    except ValidationError as error:
+        raise ConfigError(f"{name}: {_first_problem(error)}") from error
+
+
+def build_meso(content: dict[str, Any]) -> Mesostructure:
+    """Return the mesostructure that `content` ('type' and its arguments) describes.
+
+    Raises:
+        ConfigError: the type or an argument is unknown or out of range.
+    """
+    try:
+        return MesoConfig.model_validate(content).build()
+    except ValidationError as error:
+        raise ConfigError(f"meso: {_first_problem(error)}") from error
+
+
+def with_silhouette(config: Config, silhouette: Silhouette) -> Config:
+    """Return `config` with another silhouette test."""
+    return config.model_copy(update={"render": replace(config.render, silhouette=silhouette)})
+
+
+def data_dir() -> Path:
+    """Return the folder `data:` stands for: TORCHMESO_DATA, else shared/data beside the checkout."""
+    beside = Path(__file__).resolve().parents[2] / "shared" / "data"
+    return Path(os.environ.get("TORCHMESO_DATA", beside))
+
+
+PATH_KEYS = ("mesh", "model", "displacement", "albedo", "path")
+
+
+def _resolve(content: Any, folder: Path) -> Any:
+    """Return `content` with every path made absolute."""
+    if isinstance(content, dict):
+        return {
+            k: _absolute(v, folder) if k in PATH_KEYS and isinstance(v, str) else _resolve(v, folder)
+            for k, v in content.items()
+        }
+    if isinstance(content, list):
+        return [_resolve(x, folder) for x in content]
+    return content
+
+
+def _absolute(text: str, folder: Path) -> str:
+    if not text.startswith("data:"):
+        return str(folder / text)
+    root = data_dir()
+    if not root.is_dir():
+        raise FormatError(
+            f"{text}: the folder of real inputs {root} is missing; set TORCHMESO_DATA to where it is on this machine"
+        )
+    return str(root / text.removeprefix("data:"))
+
+
+def _is_path(value: Any) -> bool:
+    return isinstance(value, str)
+
+
+def _first_problem(error: ValidationError) -> str:
+    """Return one sentence on the first problem of a validation."""
+    problems = error.errors()
+    # A misspelt key is both unknown and missing: say the former.
+    unknown = [p for p in problems if p["type"] in ("extra_forbidden", "unexpected_keyword_argument")]
+    problem = (unknown or problems)[0]
+    # Union branches and model names are pydantic's own; readers know keys and positions.
+    place = ".".join(str(x) for x in problem["loc"] if str(x) not in ("directional", "point", "spot"))
+    context = problem.get("ctx", {}).get("error")
+    if isinstance(context, MesoError):
+        return str(context)
+    if problem["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
+        key = str(problem["loc"][-1])
+        parent = place.rpartition(".")[0]
+        return f"unknown key '{place}'{did_you_mean(key, _known_keys(parent))}"
+    if problem["type"] in ("missing", "missing_keyword_only_argument"):
+        return f"'{place}' is missing"
+    text = problem["msg"].removeprefix("Value error, ")
+    text = text[0].lower() + text[1:]
+    if isinstance(context, ValueError):
+        return f"{place}: {text}" if place else text
+    return f"{place}: {text}, got {problem['input']!r}"
+
+
+def _known_keys(place: str) -> list[str]:
+    """Return the keys that are known at a dotted place of a configuration."""
+    here: Any = Config
+    for step in place.split(".") if place else []:
+        fields = _fields(here)
+        here = fields.get(step, here)
+    return list(_fields(here)) or [place]
+
+
+def _fields(kind: Any) -> dict[str, Any]:
+    """Return the keys of a kind of section, with the kind of what is below each."""
+    below = {
+        "materials": MaterialConfig,
+        "objects": ObjectConfig,
+        "camera": CameraConfig,
+        "render": FrameOptions,
+        "truth": TruthConfig,
+        "btf": BtfOptions,
+        "mdf": MdfOptions,
+        "eigen": EigenOptions,
+        "lights": SpotConfig,
+    }
+    if inspect.isclass(kind) and issubclass(kind, BaseModel):
+        names = list(kind.model_fields)
+    else:
+        names = list(inspect.signature(kind).parameters)
+    return {name: below.get(name, kind) for name in names}

@@ -1,0 +1,186 @@
+"""Materials as a configuration asks for them: baked, compressed, and kept by content.
+
+What was made once from the same mesostructure, options and code lies in the cache (`data.store.cache_dir`) and is
+only opened; a bake that was cut off goes on where it stopped.
+
+Test: tests/pipeline/test_bake.py
+"""
+
+import hashlib
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from pathlib import Path
+
+from torchmeso.compress import eigen
+from torchmeso.config import Config, MaterialConfig, MesoConfig
+from torchmeso.data import btf, eigen_btf, mdf, store
+from torchmeso.errors import ConfigError, FormatError
+from torchmeso.meso import bake_btf, bake_mdf
+from torchmeso.render.scene import Material
+
+Report = Callable[[str, float], None]
+"""Called with what is being done and the share done, 0..1."""
+
+CODE = ("meso", "transport", "geometry", "data", "compress", "algebra")
+"""Folders whose code decides what a bake holds."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Asset:
+    """A material ready to render, and what it took.
+
+    Attributes:
+        material: for `render`.
+        seconds: wall time by step, empty where everything came from the cache.
+        raw_bytes: BTF and MDF on disk before compression; 0 where no table was baked.
+        model_bytes: the run-time model.
+    """
+
+    material: Material
+    seconds: dict[str, float]
+    raw_bytes: int
+    model_bytes: int
+
+
+def silent(what: str, share: float) -> None:
+    """Report nothing."""
+
+
+def prepare(config: Config, report: Report = silent) -> dict[str, Asset]:
+    """Return the materials that the objects of `config` use, baking what is not in the cache.
+
+    Raises:
+        MesoError: a file is missing, or an option is out of range.
+    """
+    used = {item.material for item in config.objects}
+    return {name: prepare_material(name, m, report) for name, m in config.materials.items() if name in used}
+
+
+def prepare_material(name: str, material: MaterialConfig, report: Report = silent) -> Asset:
+    """Return one material, baked and compressed or from the cache."""
+    if material.albedo is not None:
+        return Asset(material=Material(albedo=material.albedo), seconds={}, raw_bytes=0, model_bytes=0)
+    if material.model is not None:
+        opened = open_model(material.model)
+        return Asset(material=opened, seconds={}, raw_bytes=0, model_bytes=Path(material.model).stat().st_size)
+    assert material.meso is not None
+    seconds: dict[str, float] = {}
+    model = model_path(material)
+    if not model.exists():
+        btf_table, mdf_table = bake_tables(name, material, report, seconds)
+        start = time.perf_counter()
+        fitted = eigen.fit(btf.load(btf_table), material.eigen, progress=lambda x: report(f"{name}: eigen BTF", x))
+        seconds["compress"] = time.perf_counter() - start
+        eigen_btf.save(fitted, model, silhouette=mdf.load(mdf_table))
+    raw = sum(_size_on_disk(p) for p in table_paths(material))
+    return Asset(material=open_model(model), seconds=seconds, raw_bytes=raw, model_bytes=model.stat().st_size)
+
+
+def bake_tables(
+    name: str,
+    material: MaterialConfig,
+    report: Report,
+    seconds: dict[str, float],
+    *,
+    out: Path | None = None,
+    force: bool = False,
+) -> tuple[Path, Path]:
+    """Bake the BTF and the MDF of a material into the cache, or into the folder `out` under its name.
+
+    Raises:
+        ConfigError: there is nothing to bake, or another table lies in `out` and `force` is not given.
+    """
+    if material.meso is None:
+        raise ConfigError(f"materials.{name}: expected a mesostructure ('meso') to bake, found none")
+    paths = table_paths(material)
+    if out is not None:
+        paths = (out / f"{name}.btf.zarr", out / f"{name}.mdf.zarr")
+    keys = _keys(material)
+    if all(_is_finished(path, key) for path, key in zip(paths, keys, strict=True)):
+        return paths
+    for path, key in zip(paths, keys, strict=True):
+        if out is not None and path.exists() and not force and not _is_finished(path, key):
+            raise ConfigError(f"{path}: holds another table; give --force to replace it, or another folder")
+        path.parent.mkdir(parents=True, exist_ok=True)
+    meso = material.meso.build()
+    about: dict[str, object] = {"source": {"type": material.meso.type, **material.meso.arguments}}
+    start = time.perf_counter()
+    if not _is_finished(paths[1], keys[1]):
+        bake_mdf.bake(
+            meso, material.mdf, paths[1], about={**about, "key": keys[1]}, progress=lambda x: report(f"{name}: MDF", x)
+        )
+    seconds["mdf"] = time.perf_counter() - start
+    start = time.perf_counter()
+    if not _is_finished(paths[0], keys[0]):
+        bake_btf.bake(
+            meso, material.btf, paths[0], about={**about, "key": keys[0]}, progress=lambda x: report(f"{name}: BTF", x)
+        )
+    seconds["btf"] = time.perf_counter() - start
+    return paths
+
+
+def open_model(path: str | Path) -> Material:
+    """Return the material in a run-time model (.meso); its maps stay on disk until a scene needs them.
+
+    Raises:
+        FormatError: the file is missing, damaged, or holds no eigen BTF.
+    """
+    return Material(btf=eigen_btf.load(path), mdf=mdf.from_model(store.Model(path)))
+
+
+def table_paths(material: MaterialConfig) -> tuple[Path, Path]:
+    """Return where the cache keeps the BTF and the MDF of a material."""
+    btf_key, mdf_key = _keys(material)
+    return store.cache_dir() / f"{btf_key}.btf.zarr", store.cache_dir() / f"{mdf_key}.mdf.zarr"
+
+
+def model_path(material: MaterialConfig) -> Path:
+    """Return where the cache keeps the run-time model of a material."""
+    return store.cache_dir() / f"{store.content_hash(_keys(material), asdict(material.eigen))}.meso"
+
+
+@lru_cache(maxsize=1)
+def code_hash(folders: tuple[str, ...] = CODE) -> str:
+    """Return a hash of the code that decides what a bake holds, so that no cache outlives it."""
+    root = Path(__file__).resolve().parents[1]
+    digest = hashlib.sha256()
+    for folder in folders:
+        for file in sorted((root / folder).glob("*.py")):
+            digest.update(file.read_bytes())
+    return digest.hexdigest()[:24]
+
+
+def describe_meso(meso: MesoConfig) -> list:
+    """Return what a mesostructure is made of, file contents included, for a content hash."""
+    arguments = {k: v for k, v in meso.arguments.items() if Path(str(v)) not in meso.files}
+    return [meso.type, arguments, [file_hash(path) for path in meso.files]]
+
+
+def file_hash(path: str | Path) -> str:
+    """Return a hash of a file's content.
+
+    Raises:
+        FormatError: it is missing.
+    """
+    if not Path(path).is_file():
+        raise FormatError(f"{path}: expected a file, found none; check the path")
+    return hashlib.sha256(Path(path).read_bytes()).hexdigest()[:24]
+
+
+def _keys(material: MaterialConfig) -> tuple[str, str]:
+    assert material.meso is not None
+    about = [describe_meso(material.meso), code_hash()]
+    return store.content_hash(about, asdict(material.btf)), store.content_hash(about, asdict(material.mdf))
+
+
+def _is_finished(path: Path, key: str) -> bool:
+    if not path.is_dir():
+        return False
+    kind = "btf" if path.name.endswith(".btf.zarr") else "mdf"
+    return store.attributes(store.open_table(path, kind)).get("key") == key
+
+
+def _size_on_disk(path: Path) -> int:
+    return sum(f.stat().st_size for f in path.rglob("*") if f.is_file()) if path.is_dir() else 0

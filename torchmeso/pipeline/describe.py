@@ -1,0 +1,124 @@
+"""What is in a file: sizes, directions, origin.
+
+Test: tests/pipeline/test_describe.py
+"""
+
+from pathlib import Path
+from typing import Any
+
+from torchmeso import config
+from torchmeso.data import btf, image, mdf, store
+from torchmeso.errors import FormatError, human_size
+from torchmeso.geometry import mesh
+
+
+def file(path: str | Path) -> dict[str, Any]:
+    """Return facts about a table, a model, a configuration, a picture or a mesh, by name.
+
+    Raises:
+        FormatError: the file is missing or damaged, or its kind is not known.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise FormatError(f"{path}: expected a file, found none; check the path")
+    name = path.name.lower()
+    if name.endswith(".btf.zarr"):
+        return _btf(path)
+    if name.endswith(".mdf.zarr"):
+        return _mdf(path)
+    if name.endswith(".meso"):
+        return _model(path)
+    if name.endswith((".yaml", ".yml")):
+        return _config(path)
+    if name.endswith((".png", ".jpg", ".jpeg", ".exr")):
+        rgb = image.read(path)
+        return {"kind": "picture", "size": f"{rgb.shape[1]} x {rgb.shape[0]}", "largest value": float(rgb.max())}
+    if name.endswith((".obj", ".ply", ".glb", ".gltf", ".off", ".stl")):
+        return _mesh(path)
+    raise FormatError(
+        f"{path}: expected a table (.btf.zarr, .mdf.zarr), a model (.meso), a configuration (.yaml), "
+        "a picture or a mesh"
+    )
+
+
+def _btf(path: Path) -> dict[str, Any]:
+    table = btf.load(path)
+    group = store.open_table(path, "btf")
+    return {
+        "kind": "BTF table",
+        "lights": f"{len(table.lights)}, {table.lights.name}",
+        "views": f"{len(table.views)}, {table.views.name}",
+        "texels": f"{table.texels[1]} x {table.texels[0]}",
+        "slab depth (tiles)": table.h,
+        **_origin(store.attributes(group)),
+        "on disk": _size(path),
+    }
+
+
+def _mdf(path: Path) -> dict[str, Any]:
+    table = mdf.load(path)
+    group = store.open_table(path, "mdf")
+    return {
+        "kind": "MDF table",
+        "views": f"{len(table.directions)}, {table.directions.name}",
+        "texels": f"{table.texels[1]} x {table.texels[0]}",
+        "slab depth (tiles)": table.h,
+        "largest drop": table.delta_max,
+        "entries without a hit": 0.0 if table.no_hit is None else float(table.no_hit.float().mean()),
+        **_origin(store.attributes(group)),
+        "on disk": _size(path),
+    }
+
+
+def _model(path: Path) -> dict[str, Any]:
+    model = store.Model(path)
+    about: dict[str, Any] = {"kind": f"run-time model ({model.meta.get('kind', 'unknown')})"}
+    if "eigen" in model.meta:
+        eigen = model.meta["eigen"]
+        first = model.read("eigen.map.0")
+        about |= {
+            "rank": eigen["rank"],
+            "lights": eigen["lights"],
+            "views": eigen["views"],
+            "texels": f"{first.shape[2]} x {first.shape[1]}",
+            "storage": str(first.dtype).removeprefix("torch."),
+        }
+    if "mdf" in model.meta:
+        about["MDF"] = f"{model.meta['mdf']['directions']}, h = {model.meta['mdf']['h']:g} tiles"
+    return {**about, "on disk": _size(path)}
+
+
+def _config(path: Path) -> dict[str, Any]:
+    settings = config.load(path)
+    return {
+        "kind": "configuration",
+        "name": settings.name,
+        "materials": ", ".join(settings.materials),
+        "objects": ", ".join(f"{o.shape or Path(str(o.mesh)).name} ({o.material})" for o in settings.objects),
+        "lights": ", ".join(light.type for light in settings.lights) or "none",
+        "picture": f"{settings.camera.width} x {settings.camera.height}",
+        "silhouette": settings.render.silhouette,
+    }
+
+
+def _mesh(path: Path) -> dict[str, Any]:
+    vertices, faces, uv = mesh.read_arrays(path)
+    about: dict[str, Any] = {"kind": "mesh", "vertices": len(vertices), "triangles": len(faces)}
+    if uv is None:
+        return {**about, "texture coordinates": "none; a configuration can make some with unwrap: true"}
+    dressed = mesh.dress(vertices, faces, uv, name=path.name)
+    return {
+        **about,
+        "components": f"{len(dressed.closed)}, {int(dressed.closed.sum())} closed",
+        "texture scale": f"{float(dressed.scale.median()):.4g} world units per unit of uv",
+        "anisotropy": round(mesh.anisotropy(dressed), 3),
+    }
+
+
+def _origin(about: dict[str, Any]) -> dict[str, Any]:
+    return {"made from": about["source"]} if "source" in about else {}
+
+
+def _size(path: Path) -> str:
+    files = [path] if path.is_file() else [f for f in path.rglob("*") if f.is_file()]
+    return human_size(sum(f.stat().st_size for f in files))
