@@ -148,3 +148,17 @@ def test_files_that_are_no_configurations(tmp_path, monkeypatch):
     monkeypatch.setenv("TORCHMESO_DATA", str(tmp_path / "absent"))
     with pytest.raises(FormatError, match="set TORCHMESO_DATA"):
         read(minimal(objects=[{"mesh": "data:a.obj", "material": "clay"}]))
+
+
+def test_shapes_take_their_options():
+    item = ObjectConfig.model_validate({"shape": "plane", "options": {"size": [6, "4"]}, "tiles": 3, "material": "x"})
+    body = item.build_shape()
+    assert (body.vertices.amax(0) - body.vertices.amin(0)).tolist() == [6, 0, 4]
+    assert body.uv.amax(0).tolist() == [3, 3]
+
+
+@pytest.mark.errors
+def test_options_of_the_wrong_kind():
+    item = ObjectConfig.model_validate({"shape": "plane", "options": {"size": "big"}, "material": "x"})
+    with pytest.raises(ConfigError, match=r"objects\.options\.size: .*got 'big'"):
+        item.build_shape()

@@ -23,6 +23,7 @@ from torchmeso.data import height_field
 from torchmeso.errors import ConfigError, FormatError, MesoError, did_you_mean
 from torchmeso.geometry.camera import Camera, look_at
 from torchmeso.geometry.light import DirectionalLight, Light, PointLight, SpotLight
+from torchmeso.geometry.mesh import Mesh
 from torchmeso.geometry.shapes import SHAPES
 from torchmeso.meso import mesostructure
 from torchmeso.meso.bake_btf import BtfOptions
@@ -124,10 +125,7 @@ class MesoConfig(BaseModel):
         Raises:
             MesoError: an argument is out of range, or a file is missing or unreadable.
         """
-        try:
-            return validate_call(SOURCES[self.type])(**self.arguments)
-        except ValidationError as error:
-            raise ConfigError(f"meso.{_first_problem(error)}") from error
+        return _call("meso", SOURCES[self.type], self.arguments)
 
 
 class MaterialConfig(_Strict):
@@ -177,6 +175,23 @@ class ObjectConfig(_Strict):
         if self.unwrap and (self.mesh is None or self.tile_size is None):
             raise ValueError("'unwrap' makes texture coordinates for a 'mesh' and needs 'tile_size' (world units)")
         return self
+
+    def build_shape(self) -> Mesh:
+        """Return the built-in shape, before it is placed.
+
+        Raises:
+            ConfigError: an option is of the wrong kind or out of range.
+        """
+        assert self.shape is not None
+        tiles = {} if self.tiles is None else {"tiles": self.tiles_pair}
+        return _call("objects.options", SHAPES[self.shape], {**self.options, **tiles})
+
+    @property
+    def tiles_pair(self) -> tuple[float, float]:
+        """Repetitions of the texture along u and v."""
+        if self.tiles is None:
+            return 1.0, 1.0
+        return self.tiles if isinstance(self.tiles, tuple) else (self.tiles, self.tiles)
 
     def matrix(self) -> torch.Tensor:
         """Return the 4 x 4 matrix: scale, then turns around x, y and z, then the translation."""
@@ -359,6 +374,14 @@ def data_dir() -> Path:
 
 
 PATH_KEYS = ("mesh", "model", "displacement", "albedo", "path")
+
+
+def _call(place: str, function: Callable[..., Any], arguments: dict[str, Any]) -> Any:
+    """Call `function` with arguments from a file, brought to the types it asks for."""
+    try:
+        return validate_call(function)(**arguments)
+    except ValidationError as error:
+        raise ConfigError(f"{place}.{_first_problem(error)}") from error
 
 
 def _resolve(content: Any, folder: Path) -> Any:

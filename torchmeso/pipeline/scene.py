@@ -11,7 +11,6 @@ import torch
 from torchmeso.config import Config, ObjectConfig
 from torchmeso.geometry import mesh, unwrap
 from torchmeso.geometry.mesh import Mesh
-from torchmeso.geometry.shapes import SHAPES
 from torchmeso.pipeline.bake import Asset
 from torchmeso.render.scene import Object, Scene
 
@@ -39,8 +38,7 @@ def build_mesh(item: ObjectConfig) -> Mesh:
         MesoError: the file is missing or unreadable, has no texture coordinates, or an option is out of range.
     """
     if item.shape is not None:
-        tiles = {} if item.tiles is None else {"tiles": _pair(item.tiles)}
-        return mesh.transform(SHAPES[item.shape](**tiles, **item.options), item.matrix())
+        return mesh.transform(item.build_shape(), item.matrix())
     assert item.mesh is not None
     vertices, faces, uv = mesh.read_arrays(item.mesh)
     if item.unwrap:
@@ -55,10 +53,5 @@ def build_mesh(item: ObjectConfig) -> Mesh:
         vertices, faces, uv = atlas.vertices, atlas.faces, atlas.uv
     if uv is None:
         return mesh.load(item.mesh)  # says what is missing and what to do
-    if item.tiles is not None:
-        uv = uv * torch.tensor(_pair(item.tiles))
+    uv = uv * torch.tensor(item.tiles_pair)
     return mesh.transform(mesh.dress(vertices, faces, uv, name=item.mesh), item.matrix())
-
-
-def _pair(tiles: float | tuple[float, float]) -> tuple[float, float]:
-    return tiles if isinstance(tiles, tuple) else (tiles, tiles)
