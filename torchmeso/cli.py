@@ -15,6 +15,7 @@ from typing import Any
 
 import click
 
+from torchmeso.backends.allocator import keep_freed_memory
 from torchmeso.errors import ConfigError, MesoError
 
 
@@ -23,6 +24,7 @@ class _Group(click.Group):
 
     def invoke(self, ctx: click.Context) -> Any:
         warnings.showwarning = _say
+        keep_freed_memory()
         try:
             return super().invoke(ctx)
         except MesoError as error:
@@ -206,6 +208,35 @@ def compare(a: str, b: str, out: str | None, as_json: bool) -> None:
         return
     flip = "flip not installed" if found.flip is None else f"FLIP {found.flip:.4f}"
     click.echo(f"PSNR {found.psnr:.2f} dB  SSIM {found.ssim:.4f}  {flip}  max error {found.max_error:.4g}")
+
+
+@main.command()
+@click.argument("suite", type=click.Choice(["render"]))
+@click.option("--quick", is_flag=True, help="Fewer repetitions and sweep points; never smaller sizes.")
+@click.option("--prepare", is_flag=True, help="Only bake what the suite needs into the cache.")
+@click.option("--only", multiple=True, help="Rows whose id begins with this; may be repeated.")
+@click.option("--json", "json_path", help="Write all rows to this file.")
+@click.option("--plot", "plot_path", help="Draw the curves into this picture (.png, .svg).")
+def bench(suite: str, quick: bool, prepare: bool, only: tuple[str, ...], json_path: str | None, plot_path: Any) -> None:
+    """Measure SUITE: accuracy against truth, time against peers in the same run."""
+    from torchmeso.bench import plot, render
+    from torchmeso.bench import suite as suites
+
+    with _progress() as report:
+        context = suites.Context(quick=quick, report=report)
+        if prepare:
+            render.prepare(context)
+            return
+        rows = suites.run(render.MEASUREMENTS, context, only)
+    for row in rows:
+        value = f"not measured ({row.why})" if row.value is None else f"{row.value:g} {row.unit}"
+        goal = "" if row.goal is None else f"  goal {'>=' if row.better == 'higher' else '<='} {row.goal:g}"
+        verdict = {True: "  met", False: "  MISSED", None: ""}[row.met]
+        click.echo(f"{row.id}: {value}{goal}{verdict}" + (f"  [{row.peer}]" if row.peer else ""))
+    if json_path is not None:
+        suites.write_json(json_path, suites.to_json(suite, rows, suites.describe_device()))
+    if plot_path is not None:
+        plot.draw(rows, plot_path)
 
 
 @main.command()
