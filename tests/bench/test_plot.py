@@ -6,9 +6,8 @@ from torchmeso.errors import FormatError
 
 
 def row(k, **changes):
-    curve = {"series": "rank", "x": k, "ms": 3.0}
-    return Row(**{"id": f"btf.rank.{k}", "what": "x", "value": 30.0 + k, "unit": "dB", "better": "higher", "curve": curve,
-                  **changes})  # fmt: skip
+    fields = {"id": f"btf.rank.{k}", "what": "x", "value": 30.0, "unit": "dB", "better": "higher"}
+    return Row(**{**fields, "curve": {"series": "rank", "x": k, "ms": 3.0}, **changes})
 
 
 def test_curves_become_a_picture(tmp_path):

@@ -118,8 +118,7 @@ def _context() -> Any:
     os.environ.setdefault("LP_NUM_THREADS", str(os.cpu_count()))
     os.environ.setdefault("LIBGL_ALWAYS_SOFTWARE", "1")
     try:
-        import moderngl
-
+        moderngl: Any = import_module("moderngl")
         context = moderngl.create_context(standalone=True, backend="egl")
     except Exception as error:  # moderngl raises bare exceptions where EGL is missing
         raise PeerMissing(f"llvmpipe ({error}); run tools/setup --peers") from error
