@@ -33,7 +33,8 @@ def test_goal(changes, met):
 
 def test_json_keeps_what_is_known():
     assert row(goal=3, n=5).to_json() == {
-        "id": "a.b", "what": "one sentence", "value": 2.0, "unit": "x", "better": "higher", "goal": 3, "n": 5, "met": False
+        "id": "a.b", "what": "one sentence", "value": 2.0, "unit": "x", "better": "higher", "goal": 3, "n": 5,
+        "met": False,
     }  # fmt: skip
     nothing = row(value=None, why="no peer").to_json()
     assert (nothing["value"], nothing["met"], nothing["why"]) == (None, None, "no peer")
