@@ -3,6 +3,7 @@
 Test: tests/bench/test_plot.py
 """
 
+import re
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
@@ -55,7 +56,18 @@ def _groups(rows: Sequence[Row]) -> dict[str, dict[str, list[Row]]]:
             continue
         head = row.id.split(".")
         groups[f"{head[0]}: {head[1]} ({row.unit})"][str(row.curve["series"])].append(row)
-    return {title: dict(series) for title, series in groups.items()}
+    several = {t: {k: _sorted(v) for k, v in g.items() if len(v) > 1} for t, g in groups.items()}
+    return {title: series for title, series in several.items() if series}
+
+
+def _sorted(members: list[Row]) -> list[Row]:
+    """Order a series by its dial where that is a number, or begins with one (12x5)."""
+
+    def key(row: Row) -> float:
+        found = re.match(r"[\d.]+", str(row.curve["x"] if row.curve else ""))
+        return float(found[0]) if found else 0.0
+
+    return sorted(members, key=key)
 
 
 def _line(axis, name: str, members: list[Row]) -> None:

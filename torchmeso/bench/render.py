@@ -242,6 +242,11 @@ def btf(context: Context) -> Iterator[Row]:
         rgb, ms = _shaded(base, best.truncated(rank))
         curve = {"series": "rank", "x": rank, "ms": ms, "bytes": 4 * best.maps[..., :rank, :].numel()}
         yield from _colour_rows(f"btf.rank.{rank}", f"eigen BTF of rank {rank}, float32", rgb, full, reference, curve)
+    # The base point of the sweeps over texels and directions.
+    rgb, ms = _shaded(base, best.truncated(8))
+    for series, x in (("texels", "64"), ("directions", "12x5")):
+        what = f"eigen BTF of rank 8, float32, {series} {x}"
+        yield from _colour_rows(f"btf.{series}.{x}", what, rgb, None, reference, {"series": series, "x": x, "ms": ms})
     for storage in STORAGES:
         model = eigen.fit(table, EigenOptions(rank=8, storage=storage))
         rgb, ms = _shaded(base, model)

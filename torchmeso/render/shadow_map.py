@@ -1,15 +1,15 @@
 """Shadow maps that know the mesostructure, for directional, spot and point lights.
 
 wang2005mdf, section 4.2. The map is a picture of the scene from the light, silhouettes included. Because the BTF
-already holds the shadows of its own mesostructure, a blocker counts from the base of the slab:
+already holds the shadows of its own mesostructure, a blocker must not shadow the slab it lies in:
 
-    depth = min(t_f + s_f h / cos(theta_l), t_b)         closed surfaces
-    depth = t_f + s_f h / cos(theta_l)                   open ones (from behind, and plain ones: t_f)
+    closed surfaces:  shadow starts at t_b, where the ray leaves the body again
+    open surfaces:    t_f + s_f h / cos(theta_l), the base of the slab (from behind, and plain ones: t_f)
 
-To that comes a bias against self-shadowing that grows with the slope seen from the light, but for closed surfaces
-it never goes past the middle between the blocker and its own back: whatever a body rests on is still in its shadow.
-A texel keeps its triangle, so the depth is taken where the receiver's own light ray meets the triangle's plane, not
-at the texel's centre.
+Whatever lies outside a body and behind it is behind t_b, and what lies inside (a receiver in a joint) is not: so
+closed surfaces need no bias against self-shadowing at all, however steep or coarse. The base of the slab, which the
+paper takes for them too, cuts off joints where the slab is thick against the curvature. A texel keeps its triangle:
+depth is taken where the receiver's own light ray meets that plane, not at the texel's centre.
 
 Test: tests/render/test_shadow_map.py
 """
@@ -46,7 +46,7 @@ class ShadowFace(NamedTuple):
 
     Attributes:
         camera: the view.
-        triangle: (pixels,) row of `triangles` of the blocker nearest to the light, -1 = none.
+        triangle: (pixels,) row of `triangles` on which the nearest shadow starts, -1 = none.
         behind: (pixels,) distance from that triangle's plane to where the shadow starts.
         triangles: what was drawn.
     """
@@ -58,7 +58,7 @@ class ShadowFace(NamedTuple):
 
 
 SLOPE_BIAS, STEEPEST = 2.0, 0.03
-"""Bias in texels per texel of depth that the blocker falls by across one; cosines are taken no smaller than this."""
+"""Bias in texels per texel of depth that a surface falls by across one; cosines are taken no smaller than this."""
 
 
 def build(scene: Scene, world: World, light: Light, *, size: int, silhouette: Silhouette) -> ShadowMap:
@@ -93,25 +93,25 @@ def _draw(scene: Scene, world: World, camera: Camera, silhouette: Silhouette) ->
     candidates, _ = find_candidates(scene, world, camera, layers, silhouette, depths=False)
     blockers = (candidates.fragment >= 0).nonzero()[:, 0]  # a light inside a solid lights that solid's surroundings
     candidates = Candidates(*(x[blockers] for x in candidates))
-    points = interpolate(world, layers, camera, candidates.fragment)
+    closed = candidates.back >= 0
+    surface = torch.where(closed, candidates.back, candidates.fragment)
+    points = interpolate(world, layers, camera, surface)
     cosine = dot(points.frame.n, -rays(camera, candidates.pixel)[1])
-    h = torch.tensor([0.0 if o.material.mdf is None else o.material.mdf.h for o in scene.objects])[points.owner]
-    front = layers.triangles.front[layers.triangle[candidates.fragment]]
-    textured = front & (h > 0) & (silhouette != "none")
-    thickness = candidates.t_back - candidates.t
-    below = torch.where(textured, points.scale * h / cosine.clamp(min=MIN_COS), 0).minimum(thickness)
-    texel = torch.full_like(cosine, camera.pixel_size)
-    if camera.projection == "perspective":
-        texel = texel * candidates.t
     steep = cosine.abs().clamp(min=STEEPEST)
+    t = layers.t[surface]
+    texel = camera.pixel_size * (t if camera.projection == "perspective" else torch.ones_like(t))
     bias = texel * (1 + SLOPE_BIAS * (1 - steep.square()).clamp(min=0).sqrt() / steep)
-    # Below a mesostructure a receiver may lie a little deeper than the back of a thin rim: one texel is left there.
-    room = ((thickness - below) / 2).clamp(min=0)
-    behind = below + torch.minimum(bias, torch.where(textured, torch.maximum(room, texel), room))
-    first = nearest(candidates, candidates.t + behind)
+
+    # Closed: a little before the back, so that the far side of a body is in its own shadow, but not before the middle.
+    inside = -torch.minimum(bias, (t - candidates.t) / 2)
+    h = torch.tensor([0.0 if o.material.mdf is None else o.material.mdf.h for o in scene.objects])[points.owner]
+    textured = layers.triangles.front[layers.triangle[surface]] & (silhouette != "none")
+    slab = torch.where(textured, points.scale * h / cosine.clamp(min=MIN_COS), 0)
+    behind = torch.where(closed, inside, slab + bias)
+    first = nearest(candidates, t + behind)
     n_pixel = camera.width * camera.height
     triangle, offset = torch.full((n_pixel,), -1), torch.zeros(n_pixel)
-    triangle[candidates.pixel[first]] = layers.triangle[candidates.fragment[first]]
+    triangle[candidates.pixel[first]] = layers.triangle[surface[first]]
     offset[candidates.pixel[first]] = behind[first]
     return ShadowFace(camera, triangle, offset, layers.triangles)
 

@@ -51,15 +51,15 @@ class Candidates(NamedTuple):
     Attributes:
         pixel: (n,).
         fragment: (n,) the front fragment; -1: the eye is inside.
+        back: (n,) the fragment that closes the interval; -1 for open surfaces, and where nothing does.
         t: (n,) depth of the front fragment on the base surface.
-        t_back: (n,) depth at which the interval closes; inf for open surfaces.
         depth: (n,) t + d_f: where the mesostructure is met.
     """
 
     pixel: Int[Tensor, "n"]
     fragment: Int[Tensor, "n"]
+    back: Int[Tensor, "n"]
     t: Float[Tensor, "n"]
-    t_back: Float[Tensor, "n"]
     depth: Float[Tensor, "n"]
 
 
@@ -154,10 +154,10 @@ def find_candidates(
         d_single[facing] = _look(ends, single[facing], towards=True).depth(bottom=True)
     pixel = torch.cat([found.pixel[hit], layers.pixel[single]])
     fragment = torch.cat([found.front[hit], single])
+    back = torch.cat([found.back[hit], torch.full_like(single, -1)])
     t = torch.cat([t_front[hit], t_single])
     depth = torch.cat([t_front[hit] + d_front[hit], t_single + d_single])
-    t_back = torch.cat([t_back[hit], torch.full_like(t_single, torch.inf)])
-    return Candidates(pixel, fragment, t, t_back, depth), counts
+    return Candidates(pixel, fragment, back, t, depth), counts
 
 
 def nearest(candidates: Candidates, depth: Float[Tensor, "n"]) -> Int[Tensor, "m"]:
@@ -232,7 +232,9 @@ def _test_curved(ends: _Ends) -> _Verdict:
         last = curved_silhouette.end(ends.world, ends.camera, ends.layers, found.back[mine], front=False)
         meeting = curved_silhouette.meet(first, last, length[mine], mdf)
         hit[mine], deep[mine] = meeting.hit, ~meeting.marched
-        d_front[mine] = torch.where(meeting.marched, meeting.at, d_front[mine])
+        if ends.depths:
+            # On long chords the circle is too flat and the march stops late; the planar look-up never does.
+            d_front[mine] = torch.where(meeting.marched, meeting.at.minimum(d_front[mine]), d_front[mine])
         if mdf.no_hit is not None:
             through = mine[~meeting.marched]
             inside = Intervals(*(x[through] for x in found))
