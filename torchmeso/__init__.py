@@ -30,7 +30,11 @@ Camera
     distance along the pixel's ray, float32; ties are ordered by triangle.
 Intervals
     A ray is inside a closed component from an opening to a closing face (winding 0 -> 1 -> 0); it hits the
-    mesostructure when d_f + d_b <= |p_f - p_b|, with d = s D at the two ends (wang2005mdf, section 4.1).
+    mesostructure when d_f + d_b <= |p_f - p_b|, with d = s D at the two ends (wang2005mdf, section 4.1; `paper`), or
+    when it dips below the relief on its way under the curved surface (`curved`). Open surfaces are single layers.
+Shadows
+    A closed surface casts its shadow from where the light leaves it, an open one from the base of its slab. A receiver
+    is p - s D wo_world: the point that is seen, not the one on the base surface.
 Axes
     `light view H W C` for a BTF, `view H W` for an MDF; einsum letters l v h w k c. Random state is a
     `torch.Generator` argument; the same seed gives the same bits at any thread count. float32 to compute, float64 to

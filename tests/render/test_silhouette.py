@@ -5,12 +5,12 @@ import torch
 
 from tests.render.scenes import camera, scene
 from torchmeso.data.mdf import Mdf
-from torchmeso.geometry import hemisphere, mesh, shapes
+from torchmeso.geometry import frames, hemisphere, mesh, shapes
 from torchmeso.meso import bake_mdf, generators
 from torchmeso.meso.bake_mdf import MdfOptions, RayCastMdf
 from torchmeso.render.frame import FrameOptions, render
 from torchmeso.render.rasterize import rasterize
-from torchmeso.render.scene import assemble
+from torchmeso.render.scene import assemble, interpolate, rays
 from torchmeso.render.silhouette import find_candidates, find_intervals, nearest
 
 BARE, PAPER, CURVED = (FrameOptions(silhouette=s, shadows=False) for s in ("none", "paper", "curved"))
@@ -82,8 +82,6 @@ def test_length_bound_skips_only_intervals_that_hit(name):
     subject = scene(shapes.torus(tiles=(6, 2), triangles=800), mdf=RayCastMdf(meso))
     view = camera((0, 2.2, 3.2))
     world, layers, found, _ = intervals_of(subject, view)
-    from torchmeso.geometry import frames
-    from torchmeso.render.scene import interpolate, rays
 
     def depth(fragment, turn):
         points = interpolate(world, layers, view, fragment)
