@@ -58,14 +58,6 @@ def test_context_reaches_the_measurement():
     assert said == [("bench second", 0), ("bench second", 1)]
 
 
-def test_calls_are_timed_in_turns():
-    order = []
-    timing = suite.time_together({"a": lambda: order.append("a"), "b": lambda: order.append("b")}, n=3, warm=0)
-    assert order == ["a", "b"] * 3
-    assert timing["a"].low <= timing["a"].wall <= timing["a"].high
-    assert timing["b"].n == 3
-
-
 def test_written_file_names_the_machine(tmp_path):
     content = suite.to_json("render", [row()], {"cpu": "a"})
     suite.write_json(tmp_path / "a.json", content)

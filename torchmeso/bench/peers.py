@@ -15,6 +15,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchmeso.bench.scenes import knot_view
+from torchmeso.bench.timing import time_together
+from torchmeso.geometry import shapes
 from torchmeso.geometry.camera import Camera
 
 FAR = 1e3
@@ -101,10 +104,6 @@ def embree_first_hit(
 
 def llvmpipe_probe() -> float | None:
     """Return the milliseconds of a z pass over the 12k knot at 800 x 600: how fast the machine is right now."""
-    from torchmeso.bench.scenes import knot_view
-    from torchmeso.bench.suite import time_together
-    from torchmeso.geometry import shapes
-
     knot = shapes.torus_knot()
     try:
         peer = Llvmpipe(knot_view(), knot.vertices, knot.faces)

@@ -18,7 +18,8 @@ from torch import Tensor
 from torchmeso import config, quality
 from torchmeso.bench import peers, scenes
 from torchmeso.bench.peers import PeerMissing
-from torchmeso.bench.suite import Context, Measurement, Row, time_together
+from torchmeso.bench.suite import Context, Measurement, Row
+from torchmeso.bench.timing import time_together
 from torchmeso.compress import eigen
 from torchmeso.compress.eigen import EigenOptions
 from torchmeso.compress.quantize import Storage

@@ -1,4 +1,4 @@
-"""What every benchmark shares: rows, timing, the machine, and the JSON file.
+"""What every benchmark shares: rows, goals, the machine, and the JSON file.
 
 A suite is a list of measurements; a measurement has a name, which begins the ids of its rows, and yields rows.
 What was not measured is a row without a value and with the reason, never an invented figure.
@@ -9,16 +9,15 @@ Test: tests/bench/test_suite.py
 import fnmatch
 import json
 import os
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from statistics import median
 from typing import Any, Literal, NamedTuple
 
 import torch
 
 from torchmeso.bench import peers
+from torchmeso.bench.timing import time_together
 from torchmeso.data.store import replacing
 from torchmeso.errors import ConfigError, did_you_mean
 from torchmeso.pipeline.bake import Report, silent
@@ -85,32 +84,6 @@ class Measurement(NamedTuple):
 
     name: str
     run: Callable[[Context], Iterator[Row]]
-
-
-class Timing(NamedTuple):
-    """Milliseconds of one call: median, smallest, largest of wall time; median of CPU time over cores; calls."""
-
-    wall: float
-    low: float
-    high: float
-    cpu: float
-    n: int
-
-
-def time_together(calls: dict[str, Callable[[], object]], *, n: int, warm: int = 2) -> dict[str, Timing]:
-    """Return the timing of each call, taken in turns so that all meet the same noise."""
-    for call in calls.values():
-        for _ in range(warm):
-            call()
-    wall: dict[str, list[float]] = {name: [] for name in calls}
-    cpu: dict[str, list[float]] = {name: [] for name in calls}
-    for _ in range(n):
-        for name, call in calls.items():
-            before, start = time.process_time(), time.perf_counter()
-            call()
-            wall[name].append(1e3 * (time.perf_counter() - start))
-            cpu[name].append(1e3 * (time.process_time() - before) / (os.cpu_count() or 1))
-    return {k: Timing(median(w), min(w), max(w), median(cpu[k]), n) for k, w in wall.items()}
 
 
 def select(measurements: Sequence[Measurement], only: Sequence[str]) -> list[Measurement]:
