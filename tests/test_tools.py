@@ -52,7 +52,7 @@ def run(*arguments):
 def files(tmp_path):
     (tmp_path / "run.json").write_text(json.dumps(RUN))
     page = tmp_path / "page.md"
-    page.write_text("before\n<!-- bench render: raster.ms | our words, shadow.* -->\nold\n<!-- /bench -->\nafter\n")
+    page.write_text("before\n<!-- bench render: raster.ms | our words; shadow.* -->\nold\n<!-- /bench -->\nafter\n")
     return tmp_path / "run.json", page
 
 
