@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from tests.reference.rasterize import a_buffer
+from tests.tolerances import OPENCL_DEPTH
 from torchmeso.geometry import shapes
 from torchmeso.geometry.camera import Camera, look_at
 from torchmeso.geometry.rays import RayScene
@@ -205,6 +206,59 @@ def test_empty_and_invisible_meshes():
     for layers in (nothing, behind, point):
         assert len(layers.t) == 0
         assert (layers.start == 0).all()
+
+
+def by_triangle(layers):
+    """Return (pixel, triangle) of all fragments and their depths, in an order without depths."""
+    order = np.lexsort((layers.triangle.numpy(), layers.pixel.numpy()))
+    return layers.pixel.numpy()[order], layers.triangle.numpy()[order], layers.t.numpy()[order].astype(np.float64)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_opencl_draws_the_same_fragments(kind, device):
+    rng = np.random.default_rng(7)
+    for _ in range(8):
+        view, points, faces = scene(kind, rng)
+        points, faces = torch.from_numpy(points), torch.from_numpy(faces)
+        exact, fast = rasterize(view, points, faces), rasterize(view, points, faces, backend="opencl")
+        assert torch.equal(exact.start, fast.start)
+        (pixel, triangle, t), (pixel_2, triangle_2, t_2) = by_triangle(exact), by_triangle(fast)
+        assert np.array_equal(pixel, pixel_2)
+        assert np.array_equal(triangle, triangle_2)
+        assert (np.abs(t - t_2) / t).max(initial=0) < OPENCL_DEPTH["rtol"]
+        # Near to far, and equal depths by triangle.
+        same = fast.pixel[1:] == fast.pixel[:-1]
+        step = fast.t.diff()
+        assert (step[same] >= 0).all()
+        assert (fast.triangle.diff()[same & (step == 0)] > 0).all()
+
+
+@pytest.mark.parametrize("size", [(1, 1), (3, 5), (65, 63), (130, 70)])
+def test_opencl_pictures_of_any_size(size, device):
+    mesh = shapes.torus_knot(triangles=2000)
+    view = camera(*size)
+    exact, fast = (rasterize(view, mesh.vertices, mesh.faces, backend=b) for b in ("torch", "opencl"))
+    assert torch.equal(exact.start, fast.start)
+    assert np.array_equal(by_triangle(exact)[1], by_triangle(fast)[1])
+
+
+def test_opencl_drops_nothing(device):
+    """Three hundred layers everywhere: more room is asked for than there was at first."""
+    z = torch.linspace(-0.5, 0.5, 300)
+    corner = torch.tensor([[-3.0, -3, 0], [3, -3, 0], [0, 4, 0]])
+    vertices = (corner[None] + torch.stack([0 * z, 0 * z, z], -1)[:, None]).reshape(-1, 3)
+    faces = torch.arange(900).reshape(-1, 3)
+    view = camera(projection="orthographic")
+    exact, fast = (rasterize(view, vertices, faces, backend=b) for b in ("torch", "opencl"))
+    assert fast.start.diff().max() == 300
+    assert torch.equal(exact.start, fast.start)
+    assert torch.equal(exact.triangle, fast.triangle)
+
+
+def test_opencl_with_nothing_to_draw(device):
+    layers = rasterize(camera(), torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.long), backend="opencl")
+    assert len(layers.t) == 0
+    assert (layers.start == 0).all()
 
 
 def test_front_is_by_the_corners():

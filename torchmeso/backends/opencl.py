@@ -10,6 +10,7 @@ Kernels: kernels_cl/backends/opencl.cl (a self-test)          Test: tests/backen
 import os
 import re
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from importlib.resources import files
@@ -114,7 +115,9 @@ def _program(path: str, options: tuple[str, ...]) -> "cl.Program":
     source = (KERNELS / path).read_text()
     try:
         program = cl.Program(queue().context, source)
-        return program.build(["-I", str(KERNELS), "-cl-std=CL1.2", *options])
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", cl.CompilerWarning)  # the compiler's remarks are ours, not the user's
+            return program.build(["-I", str(KERNELS), "-cl-std=CL1.2", *options])
     except cl.Error as error:
         raise BackendError(f"kernels_cl/{path} did not build:\n{error}") from error
 
@@ -134,22 +137,28 @@ def buffer(x: Tensor) -> "cl.Buffer":
     return cl.Buffer(queue().context, flags, hostbuf=x.numpy())
 
 
+def read(pairs: "Sequence[tuple[cl.Buffer, Tensor]]") -> None:
+    """Wait for the queue and make what kernels wrote into `buffer`s visible in the tensors they lie over."""
+    cl = _pyopencl()
+    for device, x in pairs:
+        dtype = x.numpy().dtype
+        mapped, _ = cl.enqueue_map_buffer(queue(), device, cl.map_flags.READ, 0, tuple(x.shape), dtype)
+        mapped.base.release(queue())
+    queue().finish()
+
+
 def self_test() -> float:
     """Run a small kernel on the chosen device and return its largest error against torch (0 when sound).
 
     Raises:
         BackendError: no device, or the kernel did not build.
     """
-    cl = _pyopencl()
     x = torch.linspace(-2, 2, 1024).reshape(64, 16)
     y = torch.empty_like(x)
     device_x, device_y = buffer(x), buffer(y)
     kernel("backends/opencl.cl", "self_test")(queue(), (64,), (8,), device_x, device_y)
-    queue().finish()
-    mapped, _ = cl.enqueue_map_buffer(queue(), device_y, cl.map_flags.READ, 0, tuple(y.shape), "float32")
-    error = (torch.from_numpy(mapped.copy()) - (2 * x + 1)).abs().max().item()
-    mapped.base.release(queue())
-    return error
+    read([(device_y, y)])
+    return (y - (2 * x + 1)).abs().max().item()
 
 
 def _pyopencl() -> ModuleType:

@@ -6,17 +6,21 @@ drawn once: a closed mesh gives every ray as many front as back faces. Triangles
 at a guard band far outside the picture; a shared edge is cut at the same point from both sides. Any number of
 layers, nothing dropped.
 
-The work goes triangle -> rows -> spans -> fragments, each step one repeat_interleave.
+In torch the work goes triangle -> rows -> spans -> fragments, each step one repeat_interleave. On OpenCL tiles of the
+picture are walked by triangles, 4 x 4 pixels at once; both draw the same fragments, exactly.
 
+Kernels: kernels_cl/render/rasterize.cl
 Test: tests/render/test_rasterize.py (against a brute-force A-buffer in float64)
 """
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchmeso.backends import opencl
 from torchmeso.geometry import clip
 from torchmeso.geometry.camera import Camera
 from torchmeso.geometry.clip import Polygons
@@ -26,6 +30,10 @@ SUBPIXELS = 256
 
 GUARD_BAND = 16384.0
 """Pixels around the origin beyond which triangles are cut; keeps the integers of the edge functions below 2^52."""
+
+
+TILE, PACKED_BYTES = 64, 104
+"""Side of a tile in pixels, and bytes of a triangle, in kernels_cl/render/rasterize.cl."""
 
 
 class Triangles(NamedTuple):
@@ -66,16 +74,103 @@ class Layers(NamedTuple):
     triangles: Triangles
 
 
-def rasterize(camera: Camera, vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Layers:
+class StampLists(NamedTuple):
+    """All fragments of a picture as kernels keep them: by stamps of 4 x 4 pixels, layer upon layer.
+
+    Attributes:
+        begin: (stamps,) int32 first layer of each stamp, stamps row by row.
+        layers: (stamps,) int32 layers of its deepest pixel.
+        t: (capacity, 16) float32 distance along each pixel's ray, near to far; inf = no fragment.
+        triangle: (capacity, 16) int32 row of `triangles`.
+        triangles: the triangles that were drawn.
+    """
+
+    begin: Int[Tensor, "stamps"]
+    layers: Int[Tensor, "stamps"]
+    t: Float[Tensor, "capacity 16"]
+    triangle: Int[Tensor, "capacity 16"]
+    triangles: Triangles
+
+
+def rasterize(
+    camera: Camera,
+    vertices: Float[Tensor, "V 3"],
+    faces: Int[Tensor, "F 3"],
+    *,
+    backend: Literal["torch", "opencl"] = "torch",
+) -> Layers:
     """Return all layers of a mesh seen by `camera`.
 
     Args:
         camera: the view; nothing nearer than its near plane is drawn.
         vertices: (V, 3) world.
         faces: (F, 3).
+        backend: both draw the same fragments; depths agree to float32.
     """
     triangles = set_up(camera, vertices, faces)
-    return _fill(camera, triangles)
+    return _fill(camera, triangles) if backend == "torch" else to_layers(fill_stamps(camera, triangles), camera)
+
+
+def fill_stamps(camera: Camera, tri: Triangles) -> StampLists:
+    """Return the fragments of `tri` by OpenCL; as many layers as there are.
+
+    Raises:
+        BackendError: there is no OpenCL device.
+    """
+    n_stamp = -(-camera.width // 4) * -(-camera.height // 4)
+    begin, layers = (torch.zeros(n_stamp, dtype=torch.int32) for _ in range(2))
+    count, padded = len(tri.face), -(-len(tri.face) // 16) * 16
+    if count == 0:
+        return StampLists(begin, layers, torch.zeros(0, 16), torch.zeros(0, 16, dtype=torch.int32), tri)
+    queue, size = opencl.queue(), (np.int32(camera.width), np.int32(camera.height))
+    inputs = [opencl.buffer(_aligned(x)) for x in (tri.xy, tri.q, tri.front.to(torch.uint8), tri.area)]
+    packed = opencl.buffer(torch.empty(padded, PACKED_BYTES, dtype=torch.uint8))
+    boxes = opencl.buffer(torch.empty(4, padded, dtype=torch.int32))
+    opencl.kernel("render/rasterize.cl", "set_up")(
+        queue, (-(-padded // 64) * 64,), (64,), *inputs, packed, boxes, np.int32(count), np.int32(padded), *size,
+        np.int32(camera.projection == "perspective"),
+    )  # fmt: skip
+    tiles = -(-camera.width // TILE), -(-camera.height // TILE)
+    capacity = 4 * n_stamp
+    while True:
+        used = torch.zeros(16, dtype=torch.int32)
+        t, triangle = torch.empty(capacity, 16), torch.empty(capacity, 16, dtype=torch.int32)
+        results = [(opencl.buffer(x), x) for x in (used, begin, layers, t, triangle)]
+        device = [buffer for buffer, _ in results]
+        opencl.kernel("render/rasterize.cl", "fill_tiles")(
+            queue, tiles, (1, 1), packed, boxes, np.int32(padded // 16), *size, np.float32(camera.pixel_size),
+            device[0], np.int32(capacity), *device[1:],
+        )  # fmt: skip
+        opencl.read(results)
+        if int(used[0]) <= capacity:
+            return StampLists(begin, layers, t, triangle, tri)
+        capacity = int(used[0])
+
+
+def to_layers(lists: StampLists, camera: Camera) -> Layers:
+    """Return fragments kept by stamps in the order of pixels."""
+    stamp = torch.repeat_interleave(lists.layers.long())
+    first = lists.layers.cumsum(0) - lists.layers
+    layer = torch.arange(len(stamp)) - first[stamp]
+    source = lists.begin.long()[stamp] + layer
+    t, triangle = lists.t[source], lists.triangle[source].long()
+    across = -(-camera.width // 4)
+    lane = torch.arange(16)
+    x = 4 * (stamp % across)[:, None] + lane % 4
+    y = 4 * (stamp // across)[:, None] + lane // 4
+    there = t.isfinite()
+    pixel = (y * camera.width + x)[there]
+    order = torch.sort(pixel, stable=True).indices
+    n_pixel = camera.width * camera.height
+    start = torch.zeros(n_pixel + 1, dtype=torch.long)
+    torch.cumsum(torch.bincount(pixel, minlength=n_pixel), 0, out=start[1:])
+    return Layers(start, pixel[order], triangle[there][order], t[there][order], lists.triangles)
+
+
+def _aligned(x: Tensor) -> Tensor:
+    """Return `x` where a kernel can read it without a copy, else a copy."""
+    x = x.contiguous()
+    return x if x.data_ptr() % 64 == 0 else x.clone()
 
 
 def barycentric(layers: Layers, camera: Camera, which: Int[Tensor, "n"]) -> Float[Tensor, "n 3"]:
