@@ -57,16 +57,17 @@ def test_eye_inside_has_no_front():
     assert picture.counts["pixels inside an object"] == 64 * 64
 
 
-def test_a_cavity_ends_the_interval():
-    """A ball with a concentric hole, as one mesh: two intervals, each as long as the wall is thick."""
+def test_a_cavity_does_not_split_the_interval_around_it():
+    """A ball with a hole in it: the hole is a component of its own that bounds no matter, so it opens nothing."""
     outer, inner = shapes.sphere(radius=1.0, triangles=3000), shapes.sphere(radius=0.5, triangles=3000)
-    bars = torch.cat([outer.vertices, inner.vertices])
+    vertices = torch.cat([outer.vertices, inner.vertices])
     faces = torch.cat([outer.faces, inner.faces.flip(1) + len(outer.vertices)])
-    shell = mesh.dress(bars, faces, torch.cat([outer.uv, inner.uv]))
-    # Intervals are formed per connected component: the cavity is one of its own that closes before it opens.
-    _, _, found, _ = intervals_of(scene(shell), camera((0, 0, 5)))
+    shell = mesh.dress(vertices, faces, torch.cat([outer.uv, inner.uv]))
+    _, layers, found, _ = intervals_of(scene(shell), camera((0, 0, 5)))
+    centre = found.pixel == 32 * 64 + 32
     assert len(shell.closed) == 2
-    assert (found.pixel == 32 * 64 + 32).sum() >= 1
+    assert (layers.pixel == 32 * 64 + 32).sum() == 4
+    assert (layers.t[found.back[centre]] - layers.t[found.front[centre]]).tolist() == pytest.approx([2], abs=0.02)
 
 
 def test_open_surfaces_are_single_layers():

@@ -27,6 +27,7 @@ from torchmeso.config import Config
 from torchmeso.data import btf as btf_data
 from torchmeso.data.address import texel_centres
 from torchmeso.data.btf import Evaluable
+from torchmeso.data.mdf import Mdf
 from torchmeso.geometry import hemisphere, shapes
 from torchmeso.geometry.camera import Camera
 from torchmeso.geometry.directions import from_angles
@@ -163,6 +164,32 @@ def silhouettes(context: Context) -> Iterator[Row]:
             )
     if not context.quick:
         yield from _truth_converged()
+
+
+class _Interpolated:
+    """An MDF that answers every question by interpolating its table, as `evaluate` does."""
+
+    def __init__(self, mdf: Mdf):
+        self.h, self.no_hit, self.delta_max = mdf.h, mdf.no_hit, mdf.delta_max
+        self.evaluate = self.distance = mdf.evaluate
+        self.depth = mdf.depth
+
+
+def linear(context: Context) -> Iterator[Row]:
+    """The table with D interpolated between its azimuths, for what the relief gains."""
+    meso = generators.brick()
+    table, limit = bake_mdf.in_memory(meso, MdfOptions()), RayCastMdf(meso)
+    for case, (body, camera) in scenes.silhouette_cases().items():
+        bare = _mask(body, None, camera, "none")
+        carved = [bare & ~_mask(body, mdf, camera, "paper") for mdf in (_Interpolated(table), table, limit)]
+        yield Row(
+            id=f"linear.brick.{case}",
+            what=f"paper test, brick on {case}, D interpolated in the table: IoU of carved pixels with ray-cast D",
+            value=round(quality.iou(carved[0], carved[2]), 4),
+            unit="IoU",
+            better="higher",
+            peer=f"relief {quality.iou(carved[1], carved[2]):.4f}",
+        )
 
 
 def mdf_resolution(context: Context) -> Iterator[Row]:
@@ -319,6 +346,7 @@ MEASUREMENTS = [
     Measurement("raster", raster),
     Measurement("sheet", sheet),
     Measurement("silhouette", silhouettes),
+    Measurement("linear", linear),
     Measurement("mdf_resolution", mdf_resolution),
     Measurement("shadow", shadow),
     Measurement("btf", btf),
