@@ -219,13 +219,13 @@ def compare(a: str, b: str, out: str | None, as_json: bool) -> None:
 @click.option("--plot", "plot_path", help="Draw the curves into this picture (.png, .svg).")
 def bench(suite: str, quick: bool, prepare: bool, only: tuple[str, ...], json_path: str | None, plot_path: Any) -> None:
     """Measure SUITE: accuracy against truth, time against peers in the same run."""
-    from torchmeso.bench import plot, render
+    from torchmeso.bench import colour, plot, render
     from torchmeso.bench import suite as suites
 
     with _progress() as report:
         context = suites.Context(quick=quick, report=report)
         if prepare:
-            render.prepare(context)
+            colour.prepare(context)
             return
         rows = suites.run(render.MEASUREMENTS, context, only)
     for row in rows:

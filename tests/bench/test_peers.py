@@ -26,7 +26,7 @@ def test_llvmpipe_draws_the_same_pixels(knot):
 
 def test_embree_sees_the_same_pixels(knot):
     try:
-        first, _ = peers.embree_first_hit(scenes.knot_view(), knot.vertices, knot.faces)
+        first = peers.embree_first_hit(scenes.knot_view(), knot.vertices, knot.faces)
     except PeerMissing as missing:
         pytest.skip(str(missing))
     layers = rasterize(scenes.knot_view(), knot.vertices, knot.faces)

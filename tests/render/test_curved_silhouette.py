@@ -2,7 +2,8 @@ import pytest
 import torch
 
 from tests.render.scenes import camera, scene
-from torchmeso.geometry import shapes
+from torchmeso.data.mdf import Mdf
+from torchmeso.geometry import hemisphere, shapes
 from torchmeso.geometry.rays import RayScene
 from torchmeso.meso import generators
 from torchmeso.meso.bake_mdf import RayCastMdf
@@ -87,13 +88,18 @@ def test_deep_intervals_are_not_marched():
 
 
 def test_meeting_place_lies_on_the_relief():
-    """A flat sheet: where the march stops, the chord is as deep as the sheet."""
+    """A sheet half-way down the slab, under a sphere: where the march stops, the chord is as deep as the sheet."""
     view = camera((0, 0, 5), projection="orthographic", view_height=2.2, size=128)
     front, back, length, _ = ends(shapes.sphere(triangles=40_000), view)
-    mdf = RayCastMdf(generators.sheet(h=0.1))
+    views = hemisphere.grid(4, 2, 87.5)
+    mdf = Mdf(delta=torch.full((8, 2, 2), 0.5), no_hit=None, directions=views, h=0.2)
     meeting = curved_silhouette.meet(front, back, length, mdf)
+    # A chord of length L of the unit sphere is 1 - sqrt(1 - L^2/4 + (L/2 - t)^2) deep at t.
+    to_axis = (1 - (length / 2).square()).clamp(min=0)
+    depth = 1 - (to_axis + (length / 2 - meeting.at).square()).sqrt()
     which = meeting.hit & meeting.marched
-    assert bool((meeting.at[which] <= length[which]).all())
+    assert which.sum() > 50
+    assert (depth - 0.1 * (front.scale + back.scale) / 2)[which].abs().max() < 0.01
 
 
 def test_nothing_to_test():

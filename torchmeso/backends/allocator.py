@@ -1,4 +1,4 @@
-"""Keep freed memory: large tensors come and go every frame, and page faults would cost as much as the work.
+"""Keep freed memory: large tensors come and go every frame, and their pages would be faulted in every time.
 
 glibc gives blocks above 128 KiB back to the system as soon as they are freed, and the next tensor of that size
 faults its pages in again, one by one. A program that renders keeps them instead.

@@ -82,10 +82,8 @@ class PeerMissing(Exception):
     """A peer is not installed; the text says what is missing."""
 
 
-def embree_first_hit(
-    camera: Camera, vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]
-) -> tuple[Callable[[], Any], Callable[[], Any]]:
-    """Return calls that cast all camera rays by open3d's RaycastingScene: the first hit, and a list of all hits.
+def embree_first_hit(camera: Camera, vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Callable[[], Any]:
+    """Return a call that casts all camera rays by open3d's RaycastingScene and finds first hits.
 
     Raises:
         PeerMissing: open3d does not load.
@@ -99,7 +97,7 @@ def embree_first_hit(
     scene.add_triangles(tensor(vertices.float().numpy()), tensor(faces.numpy().astype(np.uint32)))
     origin, direction, _ = camera.rays(camera.pixel_centres().reshape(-1, 2))
     rays = tensor(np.concatenate([origin.numpy(), direction.numpy()], 1))
-    return lambda: scene.cast_rays(rays), lambda: scene.list_intersections(rays)
+    return lambda: scene.cast_rays(rays)
 
 
 def llvmpipe_probe() -> float | None:

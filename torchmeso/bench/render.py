@@ -1,4 +1,4 @@
-"""The suite `render`: accuracy of rasteriser, silhouettes, shadows and BTF, and time beside peers.
+"""The suite `render`: accuracy of rasteriser, silhouettes, shadows, MDF and BTF, and time beside peers.
 
 Test: tests/bench/test_render.py
 """
@@ -8,26 +8,21 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
-from typing import Any
 
 import torch
 from jaxtyping import Bool
 from torch import Tensor
 
 from torchmeso import config, quality
-from torchmeso.bench import peers, scenes
+from torchmeso.backends import opencl
+from torchmeso.bench import colour, peers, scenes
 from torchmeso.bench.peers import PeerMissing
 from torchmeso.bench.suite import Context, Measurement, Row
-from torchmeso.bench.timing import time_together
-from torchmeso.compress import eigen
-from torchmeso.compress.eigen import EigenOptions
-from torchmeso.compress.quantize import Storage
+from torchmeso.bench.timing import Timing, time_together
 from torchmeso.config import Config
-from torchmeso.data import btf as btf_data
 from torchmeso.data.address import texel_centres
-from torchmeso.data.btf import Evaluable
 from torchmeso.data.mdf import Mdf
+from torchmeso.errors import BackendError
 from torchmeso.geometry import hemisphere, shapes
 from torchmeso.geometry.camera import Camera
 from torchmeso.geometry.directions import from_angles
@@ -38,19 +33,18 @@ from torchmeso.meso import bake_mdf, generators
 from torchmeso.meso.bake_mdf import MdfOptions, RayCastMdf
 from torchmeso.meso.displace import displace
 from torchmeso.meso.mesostructure import Mesostructure
-from torchmeso.pipeline import bake, truth
 from torchmeso.pipeline import scene as pipeline_scene
+from torchmeso.pipeline import truth
 from torchmeso.pipeline.demo import built_in
 from torchmeso.render import frame, shadow_map
 from torchmeso.render.frame import FrameOptions
-from torchmeso.render.rasterize import rasterize
+from torchmeso.render.rasterize import fill_stamps, rasterize, set_up
 from torchmeso.render.scene import DistanceFunction, Material, Object, Scene, assemble
 from torchmeso.render.silhouette import Silhouette
 from torchmeso.transport.tracer import MeshTracer
 
 MATERIALS = ("brick", "weave")
 TESTS: tuple[Silhouette, ...] = ("paper", "curved")
-STORAGES: tuple[Storage, ...] = ("uint8", "float16", "float32")
 
 MAX_EDGE = 0.1
 """Longest edge of the displaced truth's triangles in tile units; `silhouette.truth_converged` watches it."""
@@ -70,10 +64,14 @@ def raster(context: Context) -> Iterator[Row]:
     except PeerMissing as error:
         missing["llvmpipe 4 peels"] = missing["llvmpipe z pass"] = str(error)
     try:
-        first, _ = peers.embree_first_hit(camera, knot.vertices, knot.faces)
-        calls["Embree first hit"] = first
+        calls["Embree first hit"] = peers.embree_first_hit(camera, knot.vertices, knot.faces)
     except PeerMissing as error:
         missing["Embree first hit"] = str(error)
+    try:
+        opencl.queue()
+        calls["opencl"] = lambda: fill_stamps(camera, set_up(camera, knot.vertices, knot.faces))
+    except BackendError as error:
+        missing["opencl"] = str(error)
     timing = time_together(calls, n=15 if context.quick else 41, warm=4)
     ours = timing["torch"]
     for name, short, goal in (
@@ -94,6 +92,7 @@ def raster(context: Context) -> Iterator[Row]:
             n=ours.n,
             why=missing.get(name),
         )
+    yield from _opencl_rows(timing, missing)
     layers = rasterize(camera, knot.vertices, knot.faces)
     yield Row(
         id="raster.knot12k.ms",
@@ -105,6 +104,31 @@ def raster(context: Context) -> Iterator[Row]:
         n=ours.n,
         peer=f"CPU/cores {ours.cpu:.1f} ms",
     )
+
+
+def _opencl_rows(timing: dict[str, Timing], missing: dict[str, str]) -> Iterator[Row]:
+    """The OpenCL rasteriser with its set-up in torch and its memory taken anew, beside llvmpipe: how often as fast."""
+    for name, short, goal in (("llvmpipe 4 peels", "llvmpipe_4peels", 10.0), ("llvmpipe z pass", "llvmpipe_z", 2.0)):
+        unmeasured = Row(
+            id=f"raster.opencl.vs_{short}",
+            what=f"time of {name} over all layers of the 12k knot, 800 x 600, on OpenCL (set-up in torch)",
+            value=None,
+            unit="x",
+            better="higher",
+            goal=goal,
+            why=missing.get("opencl", missing.get(name)),
+        )
+        if unmeasured.why is not None:
+            yield unmeasured
+            continue
+        ours, other = timing["opencl"], timing[name]
+        yield replace(
+            unmeasured,
+            value=round(other.wall / ours.wall, 3),
+            spread=(round(other.wall / ours.high, 3), round(other.wall / ours.low, 3)),
+            peer=f"{name} {other.wall:.1f} ms, ours {ours.wall:.1f} ms (CPU/cores {ours.cpu:.1f})",
+            n=ours.n,
+        )
 
 
 def sheet(context: Context) -> Iterator[Row]:
@@ -131,6 +155,7 @@ def silhouettes(context: Context) -> Iterator[Row]:
     for name in MATERIALS:
         meso = generators.GENERATORS[name]()
         table, limit = bake_mdf.in_memory(meso, MdfOptions()), RayCastMdf(meso)
+        table.depth(torch.zeros(1, 2))  # makes the relief, once per model: no part of a frame's time
         for case, (body, camera) in scenes.silhouette_cases().items():
             bare, seen = _mask(body, None, camera, "none"), _displaced_mask(body, meso, camera, MAX_EDGE)
             removed = bare & ~seen
@@ -206,6 +231,7 @@ def mdf_resolution(context: Context) -> Iterator[Row]:
         sweep.append(("directions", len(hemisphere.parse(views)), MdfOptions(views=views)))
     for series, x, options in sweep:
         table = bake_mdf.in_memory(meso, options)
+        table.depth(torch.zeros(1, 2))  # makes the relief, once per model: no part of a frame's time
         for test in TESTS:
             start = time.perf_counter()
             mask = _mask(body, table, camera, test)
@@ -257,49 +283,6 @@ def shadow(context: Context) -> Iterator[Row]:
         )
 
 
-def btf(context: Context) -> Iterator[Row]:
-    """Colour of the BTF: rank, storage, texels and directions, against the full table and against truth."""
-    base = close_up()
-    reference = truth.render(base, context.report).rgb
-    table = btf_data.load(_btf_table(base, context))
-    full, ms = _shaded(base, table)
-    whole = {"series": "whole table", "x": "float16", "ms": ms}
-    yield from _colour_rows("btf.full", "the whole table, float16", full, None, reference, whole)
-    best = eigen.fit(table, EigenOptions(rank=16, storage="float32"))
-    for rank in (1, 4, 16) if context.quick else (1, 2, 3, 4, 6, 8, 12, 16):
-        rgb, ms = _shaded(base, best.truncated(rank))
-        curve = {"series": "rank", "x": rank, "ms": ms, "bytes": 4 * best.maps[..., :rank, :].numel()}
-        yield from _colour_rows(f"btf.rank.{rank}", f"eigen BTF of rank {rank}, float32", rgb, full, reference, curve)
-    # The base point of the sweeps over texels and directions.
-    rgb, ms = _shaded(base, best.truncated(8))
-    for series, x in (("texels", "64"), ("directions", "12x5")):
-        what = f"eigen BTF of rank 8, float32, {series} {x}"
-        yield from _colour_rows(f"btf.{series}.{x}", what, rgb, None, reference, {"series": series, "x": x, "ms": ms})
-    for storage in STORAGES:
-        model = eigen.fit(table, EigenOptions(rank=8, storage=storage))
-        rgb, ms = _shaded(base, model)
-        size = model.maps.numel() * model.maps.element_size()
-        curve = {"series": "storage", "x": storage, "ms": ms, "bytes": size}
-        what = f"eigen BTF of rank 8, {storage}"
-        yield from _colour_rows(f"btf.storage.{storage}", what, rgb, full, reference, curve)
-    changes: dict[str, dict[str, Any]] = {f"btf.texels.{n}": {"texels": n} for n in (32, 128)}
-    for n_phi, n_theta in ((6, 3), (16, 8)):
-        directions = f"grid({n_phi}, {n_theta}, 80)"
-        changes[f"btf.directions.{n_phi}x{n_theta}"] = {"lights": directions, "views": directions}
-    for name, change in changes.items():
-        what = "eigen BTF of rank 8, float32, " + ", ".join(f"{k} {v}" for k, v in change.items())
-        material = base.materials["brick"]
-        other = material.model_copy(update={"btf": replace(material.btf, **change)})
-        if context.quick and not bake.table_paths(other)[0].exists():
-            row_id = f"{name}.psnr_vs_truth"
-            yield Row(id=row_id, what=what, value=None, unit="dB", better="higher", why="full run only")
-            continue
-        baked = btf_data.load(bake.bake_tables("brick", other, context.report, {})[0])
-        rgb, ms = _shaded(base, eigen.fit(baked, EigenOptions(rank=8, storage="float32")))
-        curve = {"series": name.split(".")[1], "x": name.split(".")[2], "ms": ms}
-        yield from _colour_rows(name, what, rgb, None, reference, curve)
-
-
 def mdf(context: Context) -> Iterator[Row]:
     """D(u, v, wo) of sheet, groove and sphere field against their closed forms, at and between the samples."""
     texels, rng = 256, torch.Generator().manual_seed(0)
@@ -349,42 +332,15 @@ MEASUREMENTS = [
     Measurement("linear", linear),
     Measurement("mdf_resolution", mdf_resolution),
     Measurement("shadow", shadow),
-    Measurement("btf", btf),
+    Measurement("btf", colour.btf),
     Measurement("mdf", mdf),
 ]
 """In the order they run."""
 
 
-def prepare(context: Context) -> None:
-    """Bake everything the suite looks at into the cache."""
-    base = close_up()
-    truth.render(base, context.report)
-    _btf_table(base, context)
-
-
 def figure12() -> Config:
     """Return Fig. 12's scene: weave on tori, pebbles (spheres) on the floor."""
     return config.load(built_in("fig12"))
-
-
-def close_up() -> Config:
-    """Return a brick cylinder that fills the picture, so that every pixel counts."""
-    content = {
-        "name": "close-up",
-        "materials": {"brick": {"meso": {"type": "brick"}, "btf": {"texels": 64, "samples": 9}}},
-        "objects": [
-            {
-                "shape": "cylinder",
-                "tiles": [8, 3],
-                "material": "brick",
-                "options": {"height": 2.356194, "triangles": 20000},
-            }
-        ],
-        "lights": [{"type": "directional", "direction": [0.5, 0.6, 0.7]}],
-        "camera": {"eye": [0.2, 0.3, 2.3], "fov_deg": 35, "width": 400, "height": 300},
-        "truth": {"samples": 32, "bounces": 2, "max_edge": 0.1},
-    }
-    return config.parse(content, folder=Path())
 
 
 def _mask(body: Mesh, mdf: DistanceFunction | None, camera: Camera, silhouette: Silhouette) -> Bool[Tensor, "H W"]:
@@ -441,43 +397,6 @@ def _cast_on(owner: Tensor, depth: Tensor, i: int, rays: tuple[Tensor, Tensor], 
 def _occluded(tracer: MeshTracer, place: Tensor, light: Light) -> Bool[Tensor, "n"]:
     towards, distance, _ = illuminate(light, place)
     return tracer.occluded(place + 1e-4 * towards, towards, distance)
-
-
-def _btf_table(settings: Config, context: Context) -> Path:
-    return bake.bake_tables("brick", settings.materials["brick"], context.report, {})[0]
-
-
-def _shaded(settings: Config, reflectance: Evaluable) -> tuple[Tensor, float]:
-    """Return the picture of the BTF on the bare mesh, and the milliseconds of its shading."""
-    material = Material(btf=reflectance)
-    objects = tuple(Object(mesh=pipeline_scene.build_mesh(o), material=material) for o in settings.objects)
-    lights = tuple(light.build() for light in settings.lights)
-    scene = Scene(objects=objects, lights=lights, ambient=settings.ambient)
-    options = FrameOptions(silhouette="none", shadows=False)
-    camera = settings.camera.build()
-    pictures = [frame.render(scene, camera, options) for _ in range(3)]
-    return pictures[0].rgb, round(1e3 * min(p.seconds["shading"] for p in pictures), 1)
-
-
-def _colour_rows(name: str, what: str, rgb: Tensor, full: Tensor | None, true: Tensor, curve: dict) -> Iterator[Row]:
-    """Yield PSNR and FLIP against the whole table (where given) and against truth."""
-    for other, reference in (("full", full), ("truth", true)):
-        if reference is None:
-            continue
-        found = quality.compare(reference, rgb)
-        against = "the whole table" if other == "full" else "path-traced truth"
-        for kind, value, better in (("psnr", found.psnr, "higher"), ("flip", found.flip, "lower")):
-            place = {**curve, "series": f"{curve['series']} {kind} vs {other}"}
-            if value is None or math.isinf(value):
-                continue
-            yield Row(
-                id=f"{name}.{kind}_vs_{other}",
-                what=f"{what}: {kind.upper()} against {against}",
-                value=round(value, 4),
-                unit="dB" if kind == "psnr" else "FLIP",
-                better="higher" if better == "higher" else "lower",
-                curve=place,
-            )
 
 
 def _sheet_depth(uv: Tensor, wo: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ import hashlib
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from functools import lru_cache
+from functools import cache
 from pathlib import Path
 
 from torchmeso.compress import eigen
@@ -122,7 +122,7 @@ def bake_tables(
 
 
 def open_model(path: str | Path) -> Material:
-    """Return the material in a run-time model (.meso); its maps stay on disk until a scene needs them.
+    """Return the material in a run-time model (.meso).
 
     Raises:
         FormatError: the file is missing, damaged, or holds no eigen BTF.
@@ -141,7 +141,7 @@ def model_path(material: MaterialConfig) -> Path:
     return store.cache_dir() / f"{store.content_hash(_keys(material), asdict(material.eigen))}.meso"
 
 
-@lru_cache(maxsize=1)
+@cache
 def code_hash(folders: tuple[str, ...] = CODE) -> str:
     """Return a hash of the code that decides what a bake holds, so that no cache outlives it."""
     root = Path(__file__).resolve().parents[1]
