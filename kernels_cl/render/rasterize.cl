@@ -1,229 +1,233 @@
-// All-layer rasteriser: every fragment of every triangle, near to far.
+// The rasteriser's kernels: vertices, triangles, those that are cut, and tiles.
 // Host: torchmeso/render/rasterize.py
-//
-// One work-item per tile of 64 x 64 pixels, stamps of 4 x 4 pixels in one vector. Edge functions are exact: at
-// pixel centres E = n + 256 (A x + B y), so E >= 0 exactly when (n >> 8) + A x + B y >= 0, and inside a tile the
-// last sum fits 32 bits (A, B < 2^23, x, y < 64) once the value at its corner is clamped to +-2^30.
-//
-// The tile is walked twice: first fragments are counted, then as many layers as the deepest pixel of each stamp needs
-// are taken from one counter, and fragments are inserted in order of depth, 16 pixels at once. Stamps lie anywhere in
-// memory; their content does not depend on the order of tiles.
 
-#define TILE 64
-#define STAMPS (TILE / 4)
-#define LIMIT (1 << 30)
+#include "render/rasterize.clh"
 
-#if __has_builtin(__builtin_reduce_or)
-#define ANY(m) (__builtin_reduce_or(m) != 0)
-#else
-#define ANY(m) any_lane(m)
-static int any_lane(const int16 m)
-{
-    const int8 a = m.lo | m.hi;
-    const int4 b = a.lo | a.hi;
-    const int2 c = b.lo | b.hi;
-    return (c.x | c.y) != 0;
-}
-#endif
+#pragma OPENCL FP_CONTRACT OFF
 
-// The lanes of a vector one by one, without a call.
-typedef union {
-    int16 vector;
-    int lane[16];
-} Lanes;
-
-#define LX ((int16)(0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3))
-#define FX ((float16)(0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3))
-#define FY ((float16)(0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3))
-#define LY ((int16)(0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3))
-
-typedef struct {
-    int a[3], b[3];      // edge functions per pixel along x and y
-    int low_x, low_y;    // pixels whose centres lie in the bounding box, inclusive
-    int high_x, high_y;
-    int perspective, pad;
-    long n[3];           // edge functions at pixel (0, 0), minus one where the edge is not top-left
-    double q[3];         // what is linear on the screen at pixel (0, 0), and per pixel along x and y
-    float q_low, q_high; // range of the corners
-} Triangle;
-
-// Sets up one triangle from snapped corners (1/256 pixel).
-__kernel void set_up(__global const double *restrict xy,    // (T, 3, 2)
-                   __global const double *restrict q,     // (T, 3)
-                   __global const uchar *restrict front,  // (T)
-                   __global const double *restrict area,  // (T)
-                   __global Triangle *restrict out,       // (T)
-                   __global int *restrict boxes,          // (4, padded): low x, low y, -high x, -high y
-                   int count, int padded, int width, int height, int perspective)
+// Projects one vertex for one view.
+__kernel void project(__global const View *restrict views, __global const double *restrict vertices,  // (V, 3)
+                      __global Projected *restrict out, __global Counters *restrict counters, const int count)
 {
     const int i = get_global_id(0);
-    if (i >= padded) return;
-    if (i >= count) {  // fills the last vector of boxes: touches no tile
-        for (int k = 0; k < 4; k++) boxes[k * padded + i] = LIMIT;
-        return;
-    }
-    Triangle t;
-    const double turn = front[i] ? -1.0 : 1.0;
-    double x[3], y[3], low_x = 1e30, low_y = 1e30, high_x = -1e30, high_y = -1e30;
-    float q_low = INFINITY, q_high = -INFINITY;
-    t.q[0] = t.q[1] = t.q[2] = 0;
-    for (int k = 0; k < 3; k++) {
-        x[k] = xy[6 * i + 2 * k];
-        y[k] = xy[6 * i + 2 * k + 1];
-        low_x = x[k] < low_x ? x[k] : low_x, high_x = x[k] > high_x ? x[k] : high_x;
-        low_y = y[k] < low_y ? y[k] : low_y, high_y = y[k] > high_y ? y[k] : high_y;
-        const float value = (float)q[3 * i + k];
-        q_low = value < q_low ? value : q_low, q_high = value > q_high ? value : q_high;
-    }
-    for (int k = 0; k < 3; k++) {
-        const int b = (k + 1) % 3, c = (k + 2) % 3;
-        const double A = (y[b] - y[c]) * turn, B = (x[c] - x[b]) * turn;
-        const double centre = -(A * x[b] + B * y[b]) + 128 * (A + B);
-        const int top_left = A > 0 || (A == 0 && B > 0);
-        t.a[k] = (int)A;
-        t.b[k] = (int)B;
-        t.n[k] = (long)centre - !top_left;
-        const double share = q[3 * i + k] / area[i];
-        t.q[0] += centre * share;
-        t.q[1] += 256 * A * share;
-        t.q[2] += 256 * B * share;
-    }
-    t.q_low = q_low;
-    t.q_high = q_high;
-    t.perspective = perspective;
-    t.pad = 0;
-    const double first_x = ceil((low_x - 128) / 256), first_y = ceil((low_y - 128) / 256);
-    const double last_x = floor((high_x - 128) / 256), last_y = floor((high_y - 128) / 256);
-    t.low_x = first_x > 0 ? (int)first_x : 0;
-    t.low_y = first_y > 0 ? (int)first_y : 0;
-    t.high_x = last_x < width - 1 ? (int)last_x : width - 1;
-    t.high_y = last_y < height - 1 ? (int)last_y : height - 1;
-    const int empty = t.low_x > t.high_x || t.low_y > t.high_y;
-    boxes[i] = empty ? LIMIT : t.low_x;
-    boxes[padded + i] = empty ? LIMIT : t.low_y;
-    boxes[2 * padded + i] = empty ? LIMIT : -t.high_x;
-    boxes[3 * padded + i] = empty ? LIMIT : -t.high_y;
-    out[i] = t;
+    if (i >= count) return;
+    __global const View *view = views + get_global_id(1);
+    const double4 p = project_point(view, vertices[3 * i], vertices[3 * i + 1], vertices[3 * i + 2]);
+    const double x = p.x / p.z, y = p.y / p.z;
+    Projected r;
+    r.q = view->perspective ? 1.0 / p.z : p.w;
+    const int ahead = p.w >= view->near;
+    const int safe = ahead && x <= GUARD_BAND && x >= -GUARD_BAND && y <= GUARD_BAND && y >= -GUARD_BAND;
+    r.x = safe ? (int)rint(x * SUBPIXELS) : 0;
+    r.y = safe ? (int)rint(y * SUBPIXELS) : 0;
+    r.state = (ahead ? AHEAD : 0) | (safe ? SAFE : 0);
+    r.pad = 0;
+    if (!ahead) counters[get_global_id(1)].behind_near = 1;
+    out[view->vertices + i] = r;
 }
 
-static int corner_value(__global const Triangle *t, int k, int x, int y)
+// Sets up sixteen faces for one view. `slots` triangles of a view stand together, cut ones behind the others.
+__kernel void set_up(__global const View *restrict views, __global const Projected *restrict projected,
+                     __global const int *restrict faces,   // (F, 3)
+                     __global const int2 *restrict tags,   // (F) component << 2 | CLOSED, object
+                     __global Triangle *restrict triangles, __global Slot *restrict slots,
+                     __global int *restrict boxes,         // (4, slots) per view: low x, low y, -high x, -high y
+                     __global int *restrict coarse,        // (4, slots / 16)
+                     __global uchar *restrict crossing,    // (padded faces) per view
+                     __global Counters *restrict counters, const int count, const int padded, const int stride,
+                     const int cull)
 {
-    const long value = (t->n[k] >> 8) + (long)t->a[k] * x + (long)t->b[k] * y;
-    return value > LIMIT ? LIMIT : value < -LIMIT ? -LIMIT : (int)value;
-}
-
-// All fragments of a picture.
-__kernel __attribute__((reqd_work_group_size(1, 1, 1)))
-void fill_tiles(__global const Triangle *restrict triangles,  // (T)
-                __global const int16 *restrict boxes,         // (4, padded / 16)
-                int vectors,                                  // padded / 16
-                int width, int height, float pixel_size,
-                __global int *restrict used,                  // (1) layers so far, also those that found no room
-                int capacity,
-                __global int *restrict begin,                 // (stamps) first layer of each stamp
-                __global int *restrict layers,                // (stamps)
-                __global float16 *restrict depth,             // (capacity) t, inf = no fragment
-                __global int16 *restrict triangle)            // (capacity)
-{
-    const int x0 = get_group_id(0) * TILE, y0 = get_group_id(1) * TILE;
-    const int x1 = x0 + TILE <= width ? x0 + TILE - 1 : width - 1;
-    const int y1 = y0 + TILE <= height ? y0 + TILE - 1 : height - 1;
-    const int across = (width + 3) >> 2;
-    int16 counts[STAMPS * STAMPS];
-    int first[STAMPS * STAMPS], filled[STAMPS * STAMPS];
-    for (int s = 0; s < STAMPS * STAMPS; s++) counts[s] = 0;
-
-    for (int pass = 0; pass < 2; pass++) {
-        for (int v = 0; v < vectors; v++) {
-            const int16 hit = (boxes[v] <= x1) & (boxes[vectors + v] <= y1) & (boxes[2 * vectors + v] <= -x0) &
-                              (boxes[3 * vectors + v] <= -y0);
-            if (!ANY(hit)) continue;
-            const Lanes hits = {hit};
-            for (int lane = 0; lane < 16; lane++) {
-                if (!hits.lane[lane]) continue;
-                const int id = 16 * v + lane;
-                __global const Triangle *t = triangles + id;
-                const int a0 = t->a[0], a1 = t->a[1], a2 = t->a[2], b0 = t->b[0], b1 = t->b[1], b2 = t->b[2];
-                const int16 e0 = a0 * LX + b0 * LY + corner_value(t, 0, x0, y0);
-                const int16 e1 = a1 * LX + b1 * LY + corner_value(t, 1, x0, y0);
-                const int16 e2 = a2 * LX + b2 * LY + corner_value(t, 2, x0, y0);
-                const float qx = (float)t->q[1], qy = (float)t->q[2], q_low = t->q_low, q_high = t->q_high;
-                const float16 q_in_stamp = qx * FX + qy * FY;
-                const int left = t->low_x > x0 ? (t->low_x - x0) >> 2 : 0;
-                const int top = t->low_y > y0 ? (t->low_y - y0) >> 2 : 0;
-                const int right = ((t->high_x < x1 ? t->high_x : x1) - x0) >> 2;
-                const int bottom = ((t->high_y < y1 ? t->high_y : y1) - y0) >> 2;
-                for (int sy = top; sy <= bottom; sy++) {
-                    for (int sx = left; sx <= right; sx++) {
-                        const int dx = 4 * sx, dy = 4 * sy, stamp = sy * STAMPS + sx;
-                        const int16 outside = (e0 + (a0 * dx + b0 * dy)) | (e1 + (a1 * dx + b1 * dy)) |
-                                              (e2 + (a2 * dx + b2 * dy)) | (x1 - x0 - dx - LX) | (y1 - y0 - dy - LY);
-                        const int16 inside = ~(outside >> 31);
-                        if (!ANY(inside)) continue;
-                        if (pass == 0) {
-                            counts[stamp] -= inside;
-                            continue;
-                        }
-                        // In double to the stamp's corner: a needle's slope is far larger than its range.
-                        float16 z = (float)(t->q[0] + t->q[1] * (x0 + dx) + t->q[2] * (y0 + dy)) + q_in_stamp;
-                        z = z < q_low ? q_low : z;
-                        z = z > q_high ? q_high : z;
-                        if (t->perspective) {
-                            const float16 u = (FX + (x0 + dx + 0.5f - 0.5f * width)) * pixel_size;
-                            const float16 w = (FY + (y0 + dy + 0.5f - 0.5f * height)) * pixel_size;
-                            const float16 square = 1.0f + u * u + w * w;
-                            // 1 / sqrt by three Newton steps: the built-in has no 16-wide form on every device.
-                            float16 r = as_float16(0x5f375a86 - (as_int16(square) >> 1));
-                            r *= 1.5f - 0.5f * square * r * r;
-                            r *= 1.5f - 0.5f * square * r * r;
-                            r *= 1.5f - 0.5f * square * r * r;
-                            z = square * r / z;
-                        }
-                        z = inside ? z : (float16)INFINITY;
-                        // Insertion: the first layer behind the new one and all after it move on by one, so that equal
-                        // depths stay in the order of triangles.
-                        int16 ids = id, moves = 0;
-                        __global float16 *d = depth + first[stamp];
-                        __global int16 *o = triangle + first[stamp];
-                        int k = 0;
-                        for (; k < filled[stamp]; k++) {
-                            const float16 z_k = d[k];
-                            const int16 id_k = o[k];
-                            moves |= z < z_k;
-                            d[k] = moves ? z : z_k;
-                            o[k] = moves ? ids : id_k;
-                            z = moves ? z_k : z;
-                            ids = moves ? id_k : ids;
-                        }
-                        if (ANY(z < INFINITY)) {
-                            d[k] = z;
-                            o[k] = ids;
-                            filled[stamp] = k + 1;
-                        }
-                    }
+    const int v = get_global_id(0);
+    if (16 * v >= padded) return;
+    __global const View *view = views + get_global_id(1);
+    __global const Projected *p = projected + view->vertices;
+    __global Counters *counted = counters + get_global_id(1);
+    const int coarse_stride = ((stride >> 4) + 15) & ~15;
+    __global int *box_of = boxes + 4 * view->slots;
+    __global int *coarse_of = coarse + get_global_id(1) * 4 * coarse_stride;
+    int around[4] = {LIMIT, LIMIT, LIMIT, LIMIT};
+    int behind = 0, cut = 0, drawn = 0, whole = 0;
+    for (int lane = 0; lane < 16; lane++) {
+        const int f = 16 * v + lane, s = view->slots + f;
+        int box[4] = {LIMIT, LIMIT, LIMIT, LIMIT}, crosses = 0;
+        if (f < count) {
+            int x[3], y[3], ahead = 0, safe = 0, front = 0;
+            double q[3];
+            for (int k = 0; k < 3; k++) {
+                const Projected c = p[faces[3 * f + k]];
+                x[k] = c.x, y[k] = c.y, q[k] = c.q;
+                ahead += c.state & AHEAD;
+                safe += c.state & SAFE;
+            }
+            crosses = ahead > 0 && safe < 3 * SAFE;
+            behind += ahead == 0;
+            cut += crosses;
+            if (safe == 3 * SAFE) {
+                const int hidden = cull && (tags[f].x & CLOSED);
+                whole++;
+                double4 planes[3];
+                if (set_up_triangle(view, x, y, q, hidden, &front, triangles + s, planes, box)) {
+                    keep_planes(slots + s, planes, box);
+                    drawn++;
                 }
+                slots[s].face = f;
+                slots[s].tag = tags[f].x | (front ? FRONT : 0);
+                slots[s].object = tags[f].y;
             }
         }
-        if (pass == 1) return;
-        int total = 0;
-        for (int s = 0; s < STAMPS * STAMPS; s++) {
-            const Lanes n = {counts[s]};
-            int deepest = 0;
-            for (int l = 0; l < 16; l++) deepest = n.lane[l] > deepest ? n.lane[l] : deepest;
-            first[s] = total;
-            filled[s] = deepest;
-            total += deepest;
+        crossing[get_global_id(1) * padded + f] = crosses;
+        for (int k = 0; k < 4; k++) {
+            box_of[k * stride + f] = box[k];
+            around[k] = MIN(around[k], box[k]);
         }
-        const int room = total ? atomic_add(used, total) : 0;
-        for (int s = 0; s < STAMPS * STAMPS; s++) {
-            const int x = (x0 >> 2) + s % STAMPS, y = (y0 >> 2) + s / STAMPS;
-            first[s] += room;
-            if (4 * x <= x1 && 4 * y <= y1) {
-                begin[y * across + x] = first[s];
-                layers[y * across + x] = filled[s];
+    }
+    for (int k = 0; k < 4; k++) coarse_of[k * coarse_stride + v] = around[k];
+    if (drawn) atomic_add(&counted->drawn, drawn);
+    if (whole > drawn) atomic_add(&counted->degenerate, whole - drawn);
+    if (cut) atomic_add(&counted->crossing, cut);
+    if (behind) atomic_add(&counted->behind, behind);
+}
+
+typedef struct {
+    double at[4], share[3];  // x w, y w, w, depth; barycentric coordinates in the whole triangle
+} Corner;
+
+// Cuts a polygon where `distance` = near, or one side of the guard band, is negative. Cut points are computed from the
+// corner inside, so that triangles that share an edge are cut at the same place, bit for bit.
+static int cut(Corner *corner, const int count, const int plane, const double near)
+{
+    Corner kept[9];
+    double distance[9];
+    int n = 0;
+    for (int k = 0; k < count; k++) {
+        const double w = corner[k].at[2] * GUARD_BAND;
+        distance[k] = plane == 0 ? corner[k].at[3] - near
+                    : plane == 1 ? corner[k].at[0] + w
+                    : plane == 2 ? w - corner[k].at[0]
+                    : plane == 3 ? corner[k].at[1] + w
+                                 : w - corner[k].at[1];
+    }
+    for (int k = 0; k < count; k++) {
+        const int next = k + 1 < count ? k + 1 : 0;
+        const int inside = distance[k] >= 0, inside_next = distance[next] >= 0;
+        if (inside) kept[n++] = corner[k];
+        if (inside != inside_next) {
+            const int from = inside ? k : next, to = inside ? next : k;
+            const double share = distance[from] / (distance[from] - distance[to]);
+            for (int c = 0; c < 4; c++)
+                kept[n].at[c] = corner[from].at[c] + share * (corner[to].at[c] - corner[from].at[c]);
+            for (int c = 0; c < 3; c++)
+                kept[n].share[c] = corner[from].share[c] + share * (corner[to].share[c] - corner[from].share[c]);
+            n++;
+        }
+    }
+    for (int k = 0; k < n; k++) corner[k] = kept[k];
+    return n;
+}
+
+// Cuts the faces that cross the near plane or the guard band; one work-item per view, so that the order of triangles is
+// always the same.
+__kernel void cut_faces(__global const View *restrict views, __global const double *restrict vertices,
+                        __global const int *restrict faces, __global const int2 *restrict tags,
+                        __global Triangle *restrict triangles, __global Slot *restrict slots, __global int *restrict boxes, __global int *restrict coarse,
+                        __global const uchar *restrict crossing, __global Counters *restrict counters,
+                        const int count, const int padded, const int stride, const int cull)
+{
+    const int number = get_global_id(0);
+    __global const View *view = views + number;
+    __global Counters *counted = counters + number;
+    const int coarse_stride = ((stride >> 4) + 15) & ~15;
+    __global int *box_of = boxes + 4 * view->slots;
+    __global int *coarse_of = coarse + number * 4 * coarse_stride;
+    int n = 0;
+    if (counted->crossing) {
+        for (int f = 0; f < count; f++) {
+            if (!crossing[number * padded + f]) continue;
+            Corner corner[9];
+            for (int k = 0; k < 3; k++) {
+                __global const double *v = vertices + 3 * faces[3 * f + k];
+                const double4 p = project_point(view, v[0], v[1], v[2]);
+                corner[k].at[0] = p.x, corner[k].at[1] = p.y, corner[k].at[2] = p.z, corner[k].at[3] = p.w;
+                for (int c = 0; c < 3; c++) corner[k].share[c] = c == k;
             }
-            filled[s] = 0;
+            int corners = 3;
+            for (int plane = 0; plane < 5 && corners; plane++) corners = cut(corner, corners, plane, view->near);
+            for (int k = 1; k + 1 < corners; k++, n++) {
+                if (padded + n >= stride) continue;  // the host gives more room and asks again
+                const int fan[3] = {0, k, k + 1}, s = view->slots + padded + n;
+                int x[3], y[3], front = 0, box[4] = {LIMIT, LIMIT, LIMIT, LIMIT};
+                double q[3];
+                for (int c = 0; c < 3; c++) {
+                    const Corner *at = corner + fan[c];
+                    x[c] = (int)rint(at->at[0] / at->at[2] * SUBPIXELS);
+                    y[c] = (int)rint(at->at[1] / at->at[2] * SUBPIXELS);
+                    q[c] = view->perspective ? 1.0 / at->at[2] : at->at[3];
+                }
+                const int hidden = cull && (tags[f].x & CLOSED);
+                double4 planes[3];
+                if (set_up_triangle(view, x, y, q, hidden, &front, triangles + s, planes, box)) {
+                    // From the piece's own corners to those of the face.
+                    for (int r = 0; r < 3; r++) {
+                        const double part[3] = {planes[r].x, planes[r].y, planes[r].z};
+                        double whole[3] = {0, 0, 0};
+                        for (int c = 0; c < 3; c++)
+                            for (int j = 0; j < 3; j++) whole[j] += part[c] * corner[fan[c]].share[j];
+                        planes[r] = (double4)(whole[0], whole[1], whole[2], planes[r].w);
+                    }
+                    keep_planes(slots + s, planes, box);
+                    counted->drawn++;
+                }
+                slots[s].face = f;
+                slots[s].tag = tags[f].x | (front ? FRONT : 0);
+                slots[s].object = tags[f].y;
+                for (int b = 0; b < 4; b++) box_of[b * stride + padded + n] = box[b];
+            }
         }
-        if (!total || room + total > capacity) return;  // the host gives more room and asks again
+    }
+    counted->slots = n;
+    const int last = MIN(padded + n, stride), vectors = (last + 15) >> 4;
+    for (int f = last; f < 16 * vectors; f++)
+        for (int b = 0; b < 4; b++) box_of[b * stride + f] = LIMIT;
+    for (int v = padded >> 4; v < vectors; v++) {
+        for (int b = 0; b < 4; b++) {
+            int least = LIMIT;
+            for (int lane = 0; lane < 16; lane++) least = MIN(least, box_of[b * stride + 16 * v + lane]);
+            coarse_of[b * coarse_stride + v] = least;
+        }
+    }
+    for (int v = vectors; v < ((vectors + 15) & ~15); v++)
+        for (int b = 0; b < 4; b++) coarse_of[b * coarse_stride + v] = LIMIT;
+    counted->vectors = vectors;
+}
+
+#pragma OPENCL FP_CONTRACT ON
+
+// All fragments of a picture. Each work-item takes tile after tile until none is left.
+__kernel __attribute__((reqd_work_group_size(1, 1, 1)))
+void fill_tiles(__global const View *restrict view, __global const Triangle *restrict triangles,
+                __global const int16 *restrict boxes, __global const int16 *restrict coarse,
+                __global Counters *restrict counters, const int stride,
+                const int capacity,
+                __global int *restrict begin,       // (stamps) first layer of each stamp
+                __global int *restrict layers,      // (stamps)
+                __global float16 *restrict key,     // (capacity) grows with depth, inf = no fragment
+                __global int16 *restrict slot)      // (capacity)
+{
+    const int across = (view->width + TILE - 1) / TILE, down = (view->height + TILE - 1) / TILE;
+    const int stamps_across = (view->width + 3) >> 2;
+    Lists lists;
+    while (1) {
+        const int tile = atomic_inc(&counters->tile);
+        if (tile >= across * down) return;
+        const int x0 = tile % across * TILE, y0 = tile / across * TILE;
+        if (!fill_tile(view, triangles, boxes, coarse, counters->vectors, stride >> 4, x0, y0,
+                       tile * ROOM * STAMPS * STAMPS, &lists, key, slot, &counters->used, capacity))
+            continue;  // the host gives more room and asks again
+        for (int s = 0; s < STAMPS * STAMPS; s++) {
+            const int x = x0 + 4 * (s % STAMPS), y = y0 + 4 * (s / STAMPS);
+            if (x >= view->width || y >= view->height) continue;
+            begin[(y >> 2) * stamps_across + (x >> 2)] = lists.begin[s];
+            layers[(y >> 2) * stamps_across + (x >> 2)] = lists.filled[s];
+        }
     }
 }

@@ -17,11 +17,12 @@ from importlib.resources import files
 from types import ModuleType
 from typing import TYPE_CHECKING, Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from torchmeso.backends import BackendChoice
-from torchmeso.errors import BackendError
+from torchmeso.errors import BackendError, human_size
 
 if TYPE_CHECKING:
     import pyopencl as cl
@@ -95,7 +96,7 @@ def queue() -> "cl.CommandQueue":
     """
     cl = _pyopencl()
     device = _choose(cl.get_platforms()).get_devices()[0]
-    return cl.CommandQueue(cl.Context([device]))
+    return cl.CommandQueue(cl.Context([device]), properties=cl.command_queue_properties.PROFILING_ENABLE)
 
 
 @cache
@@ -105,21 +106,111 @@ def kernel(path: str, name: str, options: tuple[str, ...] = ()) -> "cl.Kernel":
     Raises:
         BackendError: no device, or the build failed; the text carries the compiler's log.
     """
-    cl = _pyopencl()
-    return cl.Kernel(_program(path, options), name)
+    return _pyopencl().Kernel(_program(path, options), name)
+
+
+class Call:
+    """A kernel with its arguments, ready to be run again and again.
+
+    Keeps its buffers alive: OpenCL does not.
+    """
+
+    def __init__(
+        self,
+        path: str,
+        name: str,
+        size: tuple[int, ...],
+        local: tuple[int, ...],
+        arguments: "Sequence[cl.Buffer | np.generic]",
+        options: tuple[str, ...] = (),
+    ):
+        """Take `kernels_cl/<path>`'s kernel `name` over `size` work-items in groups of `local`.
+
+        Raises:
+            BackendError: no device, or the build failed.
+        """
+        self._kernel = _pyopencl().Kernel(_program(path, options), name)
+        self._kernel.set_args(*arguments)
+        self._size, self._local, self._arguments = size, local, arguments
+        self._event: cl.Event | None = None
+
+    def __call__(self) -> None:
+        """Put the kernel into the queue."""
+        self._event = _pyopencl().enqueue_nd_range_kernel(queue(), self._kernel, self._size, self._local)
+
+    @property
+    def milliseconds(self) -> float:
+        """Time of the last run, which must have ended; 0 before the first."""
+        return 0.0 if self._event is None else 1e-6 * (self._event.profile.end - self._event.profile.start)
+
+
+def compose(path: str) -> str:
+    """Return the source of `kernels_cl/<path>` with every file it includes, each once."""
+    seen: set[str] = set()
+
+    def expand(name: str) -> str:
+        if name in seen:
+            return ""
+        seen.add(name)
+        text = (KERNELS / name).read_text()
+        return re.sub(r'^#include "([^"]+)"\n', lambda found: expand(found[1]), text, flags=re.MULTILINE)
+
+    return expand(path)
 
 
 @cache
 def _program(path: str, options: tuple[str, ...]) -> "cl.Program":
     cl = _pyopencl()
-    source = (KERNELS / path).read_text()
+    program = cl.Program(queue().context, compose(path))
     try:
-        program = cl.Program(queue().context, source)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", cl.CompilerWarning)  # the compiler's remarks are ours, not the user's
-            return program.build(["-I", str(KERNELS), "-cl-std=CL1.2", *options])
+            return program.build(["-cl-std=CL1.2", *options])
     except cl.Error as error:
         raise BackendError(f"kernels_cl/{path} did not build:\n{error}") from error
+
+
+def upload(x: np.ndarray) -> "cl.Buffer":
+    """Return a buffer with a copy of `x`; of at least a block, so that an empty array is one too."""
+    cl = _pyopencl()
+    content = np.ascontiguousarray(x)
+    if content.nbytes == 0:
+        return allocate(64)
+    return cl.Buffer(queue().context, cl.mem_flags.READ_WRITE | cl.mem_flags.COPY_HOST_PTR, hostbuf=content)
+
+
+def allocate(size: int) -> "cl.Buffer":
+    """Return a buffer of `size` bytes with any content.
+
+    Raises:
+        BackendError: the device has no room for it.
+    """
+    cl = _pyopencl()
+    try:
+        return cl.Buffer(queue().context, cl.mem_flags.READ_WRITE, size=max(size, 64))
+    except cl.Error as error:
+        raise BackendError(f"opencl: no room for a buffer of {human_size(size)} ({error})") from error
+
+
+def write(device: "cl.Buffer", x: np.ndarray) -> None:
+    """Copy `x` into a buffer, in the order of the queue; `x` may be changed at once."""
+    _pyopencl().enqueue_copy(queue(), device, np.ascontiguousarray(x), is_blocking=True)
+
+
+def fetch(device: "cl.Buffer", x: np.ndarray) -> np.ndarray:
+    """Wait for the queue, copy a buffer into `x` and return it."""
+    _pyopencl().enqueue_copy(queue(), x, device, is_blocking=True)
+    return x
+
+
+def units() -> int:
+    """Return how many work-items run at once: for kernels whose work-items fetch their own work."""
+    return queue().device.max_compute_units
+
+
+def finish() -> None:
+    """Wait for the queue."""
+    queue().finish()
 
 
 def buffer(x: Tensor) -> "cl.Buffer":

@@ -99,7 +99,7 @@ class EigenBtf:
     def ambient(self, uv: Float[Tensor, "*batch 2"], wo: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
         """Return L_a(uv, wo) = (1/pi) times the integral of T over the light hemisphere (white: 1)."""
         taps = address.bilinear(uv, *self.texels)
-        E = (self._ambient_maps[taps.texel].to(uv.dtype) * taps.weight[..., None, None]).sum(-3)
+        E = (self.ambient_maps[taps.texel].to(uv.dtype) * taps.weight[..., None, None]).sum(-3)
         return (E * self.view_weights(wo).unsqueeze(-1)).sum(-2)
 
     def view_weights(self, wo: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch rank"]:
@@ -126,8 +126,8 @@ class EigenBtf:
         return hemisphere.with_pole(self.weights, self.views)
 
     @cached_property
-    def _ambient_maps(self) -> Tensor:
-        """(texel, rank, 3): E integrated over the light hemisphere, over pi."""
+    def ambient_maps(self) -> Float[Tensor, "texel rank 3"]:
+        """E integrated over the light hemisphere, over pi."""
         share = (hemisphere.quadrature(self.lights) / math.pi).to(self.scale.dtype)
         total = torch.zeros(self.maps.shape[1:], dtype=self.scale.dtype)
         for l in range(len(self.lights)):

@@ -25,6 +25,9 @@ from torchmeso.data import address
 REFINEMENT = 4
 """Texels of the relief per texel of the table, along a side."""
 
+CODES = 65535
+"""Depths are multiples of h / 65535: what kernels keep in 16 bits is then the same."""
+
 STEEPEST_STEPS, FINEST_STEPS, BISECTIONS = 16, 1024, 6
 """A ray takes one relief texel per step, but at least 16 and at most 1024 steps through the slab, then bisects."""
 
@@ -110,7 +113,8 @@ def from_views(
         open_share = no_hit.float().mean(0) > 0.5
         hole = open_share.repeat_interleave(REFINEMENT, 0).repeat_interleave(REFINEMENT, 1)
     # A hair above the bottom of the slab, so that rounding cannot let a ray through a floor that lies there.
-    return Relief(drop=refine(joined, REFINEMENT).clamp(0, h * (1 - 1e-5)), hole=hole, h=h)
+    codes = (refine(joined, REFINEMENT) / h * CODES).round().clamp(0, CODES - 1)
+    return Relief(drop=codes * (h / CODES), hole=hole, h=h)
 
 
 def refine(z: Float[Tensor, "H W"], factor: int) -> Float[Tensor, "H2 W2"]:

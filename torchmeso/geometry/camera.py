@@ -67,8 +67,9 @@ class Camera:
 
         Divide the first two by w for pixels (0, 0 = the top left corner of the picture).
         """
-        local = (points - self.eye.to(points.dtype)) @ self.axes.to(points.dtype).T
-        x, y, back = local.unbind(-1)
+        a, b, c = (points - self.eye.to(points.dtype)).unbind(-1)
+        # Products and sums one by one: kernels do the same, and corners are snapped alike to the last bit.
+        x, y, back = (a * row[0] + b * row[1] + c * row[2] for row in self.axes.to(points.dtype))
         depth = -back
         w = depth if self.projection == "perspective" else torch.ones_like(depth)
         size = self.pixel_size

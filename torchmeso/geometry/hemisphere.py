@@ -158,8 +158,8 @@ def interpolate(directions: DirectionSet, w: Float[Tensor, "*batch 3"]) -> Footp
         nodes.
     """
     theta, phi = to_angles(w)
-    rings = _rings(directions)
-    ring_theta = rings.theta.to(w.dtype)
+    table = rings(directions)
+    ring_theta = table.theta.to(w.dtype)
     theta = theta.clamp(max=ring_theta[-1])
     n_ring = len(ring_theta)
     k = (torch.searchsorted(ring_theta, theta.detach().contiguous(), right=True) - 1).clamp(0, max(n_ring - 2, 0))
@@ -168,12 +168,12 @@ def interpolate(directions: DirectionSet, w: Float[Tensor, "*batch 3"]) -> Footp
     outer = ((theta - ring_theta[k]) / span).clamp(0, 1)
     node, weight = [], []
     for ring, share in ((k, 1 - outer), (above, outer)):
-        size = rings.size[ring]
-        x = (phi - rings.phi0[ring].to(w.dtype)) * size.to(w.dtype) / (2 * math.pi)
+        size = table.size[ring]
+        x = (phi - table.phi0[ring].to(w.dtype)) * size.to(w.dtype) / (2 * math.pi)
         first = x.detach().floor()
         f = x - first
         j = first.long()
-        node += [rings.offset[ring] + j % size, rings.offset[ring] + (j + 1) % size]
+        node += [table.offset[ring] + j % size, table.offset[ring] + (j + 1) % size]
         weight += [share * (1 - f), share * f]
     return Footprint(torch.stack(node, -1), torch.stack(weight, -1))
 
@@ -202,7 +202,9 @@ def quadrature(directions: DirectionSet) -> Float[Tensor, "direction"]:
     return torch.tensor(weights, dtype=torch.float64)
 
 
-class _Rings(NamedTuple):
+class Rings(NamedTuple):
+    """The rings of a set as arrays, the pole among them where the set needs one."""
+
     theta: Tensor  # (ring) radians, the pole first
     size: Tensor  # (ring) directions in the ring
     phi0: Tensor  # (ring) radians
@@ -210,12 +212,13 @@ class _Rings(NamedTuple):
 
 
 @lru_cache(maxsize=64)
-def _rings(directions: DirectionSet) -> _Rings:
+def rings(directions: DirectionSet) -> Rings:
+    """Return the rings of `directions` as arrays."""
     theta, count, phi0 = list(directions.theta_deg), list(directions.count), list(directions.phi0_deg)
     offset = [0, *accumulate(count)][:-1]
     if directions.needs_pole:
         theta, count, phi0, offset = [0.0, *theta], [1, *count], [0.0, *phi0], [len(directions), *offset]
-    return _Rings(
+    return Rings(
         torch.tensor(theta, dtype=torch.float64).deg2rad(),
         torch.tensor(count),
         torch.tensor(phi0, dtype=torch.float64).deg2rad(),

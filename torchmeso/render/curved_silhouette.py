@@ -6,13 +6,15 @@ the place above it in the texture are followed from the front to the back, and t
 the relief of the mesostructure (D seen from straight above).
 
 With the lengths along the ray x = t / L in [0, 1], the mean curvature kappa = (cos_f + cos_b) / L from the
-interpolated normals, and the sagitta of the flat facets under the curved surface they stand for,
+interpolated normals, the sagitta of the flat facets under the curved surface they stand for, and the half angle
+psi between the ends, sin(psi) = (cos_f + cos_b) / 2, as seen from the centre of the osculating circle,
 
     q(x)     = 2 (bulge_f (1 - x) + bulge_b x) + kappa L^2 x (1 - x)
-    depth(x) = q / (1 + sqrt(1 - kappa q))                               below the osculating circle
-    uv'(x)   = L ((1 - x) rate_f + x rate_b) / (1 - kappa depth)^2       the circle, seen from below, runs faster
+    depth(x) = q / (1 + sqrt(1 - kappa q))                               below the circle
+    g(x)     = (atan(tan(psi) (2 x - 1)) / psi + 1) / 2                  share of the arc above the ray
+    uv'(g)   = L psi / (sin(psi) cos(psi)) ((1 - g) rate_f + g rate_b)
 
-What the texture coordinates of the back disagree by is spread over the interval; where they disagree by more
+What the texture coordinates of the back disagree by is spread over the arc; where they disagree by more
 than `SEAM` tiles there is a seam in between and each half keeps its own end. Where the normals turn much faster
 along the ray than on either facet, the interval cuts a crease (the rim of a cylinder): each side is then a plane.
 
@@ -152,13 +154,11 @@ def _meet(front: End, back: End, length: Tensor, mdf: DistanceFunction) -> Meeti
     scale = (front.scale + back.scale) / 2
     x = _steps()
     depth = _depth(front, back, length, kappa, x)
-    deepest = torch.maximum(length * front.slope, length * back.slope)
-    deepest = torch.where(crease, deepest, depth.amax(1))
-    marched = ~(deepest > scale * mdf.h)
+    marched = ~(crease & (length * torch.maximum(front.slope, back.slope) > scale * mdf.h))
 
     below = torch.zeros(len(length), STEPS, dtype=torch.bool)
     smooth = (marched & ~crease).nonzero()[:, 0]
-    uv = _path(front.select(smooth), back.select(smooth), length[smooth], kappa[smooth], depth[smooth], x)
+    uv = _path(front.select(smooth), back.select(smooth), length[smooth], x)
     below[smooth] = depth[smooth] / scale[smooth, None] >= mdf.depth(uv)
     cut = (marched & crease).nonzero()[:, 0]
     below[cut] = _below_planes(front.select(cut), back.select(cut), length[cut], x, mdf)
@@ -175,18 +175,22 @@ def _depth(front: End, back: End, length: Tensor, kappa: Tensor, x: Tensor) -> T
     return q / (1 + (1 - kappa[:, None] * q).clamp(min=0).sqrt())
 
 
-def _path(front: End, back: End, length: Tensor, kappa: Tensor, depth: Tensor, x: Tensor) -> Tensor:
+def _path(front: End, back: End, length: Tensor, x: Tensor) -> Tensor:
     """Return the texture coordinates above the ray at the steps, (n, steps, 2)."""
-    rate = front.rate[:, None] * (1 - x)[:, None] + back.rate[:, None] * x[:, None]
-    faster = (length / STEPS).unsqueeze(-1) / (1 - (kappa[:, None] * depth).clamp(max=0.9)).square()
-    step = rate * faster.unsqueeze(-1)
-    way = step.cumsum(1) - step / 2
-    total = step.sum(1)
-    gap = back.uv - front.uv - total
+    sine = ((front.cosine + back.cosine) / 2).clamp(min=1e-3, max=0.999)
+    half = torch.asin(sine)  # angle between the ends and the middle, seen from the circle's centre
+    cosine = (1 - sine.square()).sqrt()
+    arc = (torch.atan((sine / cosine)[:, None] * (2 * x - 1)) / half[:, None] + 1) / 2
+    reach = (length * half / (sine * cosine))[:, None]
+    first, last = reach * front.rate, reach * back.rate
+    mean = (first + last) / 2
+    gap = back.uv - front.uv - mean
     gap = gap - gap.round()
     seam = (gap.norm(dim=-1) > SEAM)[:, None, None]
-    joined = front.uv[:, None] + way + gap[:, None] * x[:, None]
-    apart = torch.where((x > 0.5)[:, None], (back.uv - total)[:, None] + way, front.uv[:, None] + way)
+    g = arc[:, :, None]
+    way = first[:, None] * g + (last - first)[:, None] * (g * g / 2)
+    joined = front.uv[:, None] + way + gap[:, None] * g
+    apart = torch.where(g > 0.5, (back.uv - mean)[:, None] + way, front.uv[:, None] + way)
     return torch.where(seam, apart, joined)
 
 

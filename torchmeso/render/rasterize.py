@@ -6,14 +6,15 @@ drawn once: a closed mesh gives every ray as many front as back faces. Triangles
 at a guard band far outside the picture; a shared edge is cut at the same point from both sides. Any number of
 layers, nothing dropped.
 
-In torch the work goes triangle -> rows -> spans -> fragments, each step one repeat_interleave. On OpenCL tiles of the
-picture are walked by triangles, 4 x 4 pixels at once; both draw the same fragments, exactly.
+In torch the work goes triangle -> rows -> spans -> fragments, each step one repeat_interleave. On OpenCL
+(`DeviceViews`) tiles of the picture are walked by triangles, 4 x 4 pixels at once; both draw the same fragments.
 
 Kernels: kernels_cl/render/rasterize.cl
 Test: tests/render/test_rasterize.py (against a brute-force A-buffer in float64)
 """
 
-from typing import Literal, NamedTuple
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
@@ -25,6 +26,9 @@ from torchmeso.geometry import clip
 from torchmeso.geometry.camera import Camera
 from torchmeso.geometry.clip import Polygons
 
+if TYPE_CHECKING:
+    import pyopencl as cl
+
 SUBPIXELS = 256
 """Sub-pixel positions per pixel and axis."""
 
@@ -32,8 +36,23 @@ GUARD_BAND = 16384.0
 """Pixels around the origin beyond which triangles are cut; keeps the integers of the edge functions below 2^52."""
 
 
-TILE, PACKED_BYTES = 64, 104
-"""Side of a tile in pixels, and bytes of a triangle, in kernels_cl/render/rasterize.cl."""
+TILE, STAMPS, ROOM = 64, 256, 8
+"""Side of a tile in pixels, its stamps, and the layers a stamp begins with, in kernels_cl/render/rasterize.clh."""
+
+TRIANGLE_BYTES, SLOT_BYTES, PROJECTED_BYTES, LIMIT = 96, 64, 24, 1 << 30
+"""Sizes of the kernels' structures, and what no box reaches."""
+
+VIEW = np.dtype(
+    [("eye", "f8", 3), ("axes", "f8", (3, 3)), ("pixel_size", "f8"), ("near", "f8")]
+    + [(name, "i4") for name in ("width", "height", "perspective", "vertices", "slots", "texels")]
+)
+"""A camera as the kernels read it."""
+
+COUNTERS = (
+    "used", "vectors", "slots", "tile", "behind_near", "crossing", "behind", "degenerate", "drawn", "fragments",
+    "deepest", "covered", "intervals", "deep", "carved", "inside", "hidden", "looked", "spared", "empty_tiles",
+)  # fmt: skip
+"""What the kernels count, in the order of `Counters` in kernels_cl/render/rasterize.clh; padded to 32."""
 
 
 class Triangles(NamedTuple):
@@ -74,103 +93,15 @@ class Layers(NamedTuple):
     triangles: Triangles
 
 
-class StampLists(NamedTuple):
-    """All fragments of a picture as kernels keep them: by stamps of 4 x 4 pixels, layer upon layer.
-
-    Attributes:
-        begin: (stamps,) int32 first layer of each stamp, stamps row by row.
-        layers: (stamps,) int32 layers of its deepest pixel.
-        t: (capacity, 16) float32 distance along each pixel's ray, near to far; inf = no fragment.
-        triangle: (capacity, 16) int32 row of `triangles`.
-        triangles: the triangles that were drawn.
-    """
-
-    begin: Int[Tensor, "stamps"]
-    layers: Int[Tensor, "stamps"]
-    t: Float[Tensor, "capacity 16"]
-    triangle: Int[Tensor, "capacity 16"]
-    triangles: Triangles
-
-
-def rasterize(
-    camera: Camera,
-    vertices: Float[Tensor, "V 3"],
-    faces: Int[Tensor, "F 3"],
-    *,
-    backend: Literal["torch", "opencl"] = "torch",
-) -> Layers:
+def rasterize(camera: Camera, vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Layers:
     """Return all layers of a mesh seen by `camera`.
 
     Args:
         camera: the view; nothing nearer than its near plane is drawn.
         vertices: (V, 3) world.
         faces: (F, 3).
-        backend: both draw the same fragments; depths agree to float32.
     """
-    triangles = set_up(camera, vertices, faces)
-    return _fill(camera, triangles) if backend == "torch" else to_layers(fill_stamps(camera, triangles), camera)
-
-
-def fill_stamps(camera: Camera, tri: Triangles) -> StampLists:
-    """Return the fragments of `tri` by OpenCL; as many layers as there are.
-
-    Raises:
-        BackendError: there is no OpenCL device.
-    """
-    n_stamp = -(-camera.width // 4) * -(-camera.height // 4)
-    begin, layers = (torch.zeros(n_stamp, dtype=torch.int32) for _ in range(2))
-    count, padded = len(tri.face), -(-len(tri.face) // 16) * 16
-    if count == 0:
-        return StampLists(begin, layers, torch.zeros(0, 16), torch.zeros(0, 16, dtype=torch.int32), tri)
-    queue, size = opencl.queue(), (np.int32(camera.width), np.int32(camera.height))
-    inputs = [opencl.buffer(_aligned(x)) for x in (tri.xy, tri.q, tri.front.to(torch.uint8), tri.area)]
-    packed = opencl.buffer(torch.empty(padded, PACKED_BYTES, dtype=torch.uint8))
-    boxes = opencl.buffer(torch.empty(4, padded, dtype=torch.int32))
-    opencl.kernel("render/rasterize.cl", "set_up")(
-        queue, (-(-padded // 64) * 64,), (64,), *inputs, packed, boxes, np.int32(count), np.int32(padded), *size,
-        np.int32(camera.projection == "perspective"),
-    )  # fmt: skip
-    tiles = -(-camera.width // TILE), -(-camera.height // TILE)
-    capacity = 4 * n_stamp
-    while True:
-        used = torch.zeros(16, dtype=torch.int32)
-        t, triangle = torch.empty(capacity, 16), torch.empty(capacity, 16, dtype=torch.int32)
-        results = [(opencl.buffer(x), x) for x in (used, begin, layers, t, triangle)]
-        device = [buffer for buffer, _ in results]
-        opencl.kernel("render/rasterize.cl", "fill_tiles")(
-            queue, tiles, (1, 1), packed, boxes, np.int32(padded // 16), *size, np.float32(camera.pixel_size),
-            device[0], np.int32(capacity), *device[1:],
-        )  # fmt: skip
-        opencl.read(results)
-        if int(used[0]) <= capacity:
-            return StampLists(begin, layers, t, triangle, tri)
-        capacity = int(used[0])
-
-
-def to_layers(lists: StampLists, camera: Camera) -> Layers:
-    """Return fragments kept by stamps in the order of pixels."""
-    stamp = torch.repeat_interleave(lists.layers.long())
-    first = lists.layers.cumsum(0) - lists.layers
-    layer = torch.arange(len(stamp)) - first[stamp]
-    source = lists.begin.long()[stamp] + layer
-    t, triangle = lists.t[source], lists.triangle[source].long()
-    across = -(-camera.width // 4)
-    lane = torch.arange(16)
-    x = 4 * (stamp % across)[:, None] + lane % 4
-    y = 4 * (stamp // across)[:, None] + lane // 4
-    there = t.isfinite()
-    pixel = (y * camera.width + x)[there]
-    order = torch.sort(pixel, stable=True).indices
-    n_pixel = camera.width * camera.height
-    start = torch.zeros(n_pixel + 1, dtype=torch.long)
-    torch.cumsum(torch.bincount(pixel, minlength=n_pixel), 0, out=start[1:])
-    return Layers(start, pixel[order], triangle[there][order], t[there][order], lists.triangles)
-
-
-def _aligned(x: Tensor) -> Tensor:
-    """Return `x` where a kernel can read it without a copy, else a copy."""
-    x = x.contiguous()
-    return x if x.data_ptr() % 64 == 0 else x.clone()
+    return _fill(camera, set_up(camera, vertices, faces))
 
 
 def barycentric(layers: Layers, camera: Camera, which: Int[Tensor, "n"]) -> Float[Tensor, "n 3"]:
@@ -357,3 +288,185 @@ def _stretch(camera: Camera, spans: _Spans, span: Tensor, step: Tensor) -> Tenso
     x = (spans.column + (0.5 - camera.width / 2)) * size
     across = x.index_select(0, span) + size * step
     return torch.sqrt((1 + y.square()).index_select(0, span) + across.square())
+
+
+class DeviceMesh(NamedTuple):
+    """Triangles as the kernels read them.
+
+    Attributes:
+        vertices: (V, 3) float64.
+        faces: (F, 3) int32.
+        tags: (F, 2) int32: component << 2 | 2 where it is closed; object.
+        n_vertex: V.
+        n_face: F.
+    """
+
+    vertices: "cl.Buffer"
+    faces: "cl.Buffer"
+    tags: "cl.Buffer"
+    n_vertex: int
+    n_face: int
+
+
+class DeviceLists(NamedTuple):
+    """All fragments of a picture as kernels keep them: by stamps of 4 x 4 pixels, layer upon layer.
+
+    Attributes:
+        pixel: (N,) row * width + column, ascending.
+        face: (N,) triangle of the mesh.
+        t: (N,) float32 distance along the pixel's ray, near to far in each pixel.
+    """
+
+    pixel: Int[Tensor, "N"]
+    face: Int[Tensor, "N"]
+    t: Float[Tensor, "N"]
+
+
+def upload_mesh(
+    vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], tags: Int[Tensor, "F 2"] | None = None
+) -> DeviceMesh:
+    """Return a mesh on the device; without `tags` an open surface.
+
+    Raises:
+        BackendError: there is no OpenCL device.
+    """
+    tags = torch.zeros(len(faces), 2, dtype=torch.int32) if tags is None else tags
+    return DeviceMesh(
+        opencl.upload(vertices.double().numpy()), opencl.upload(faces.int().numpy()),
+        opencl.upload(tags.int().numpy()), len(vertices), len(faces),
+    )  # fmt: skip
+
+
+class DeviceViews:
+    """Cameras on one mesh: its triangles on their screens, on the device."""
+
+    def __init__(self, mesh: DeviceMesh, count: int, *, cut_room: int = 0, cull: bool = False):
+        """Make room for `count` views.
+
+        Args:
+            mesh: what is seen.
+            count: cameras.
+            cut_room: triangles that faces may become which cross the near plane or the guard band.
+            cull: whether faces of closed components that are turned away are left out.
+        """
+        self.mesh, self.count = mesh, count
+        self.padded = -(-max(mesh.n_face, 1) // 16) * 16
+        self.stride = self.padded + -(-max(cut_room, 1024) // 16) * 16
+        vectors = -(-(self.stride // 16) // 16) * 16
+        self._records = np.zeros(count, VIEW)
+        self.views = opencl.upload(self._records)
+        self.projected = opencl.allocate(count * mesh.n_vertex * PROJECTED_BYTES)
+        self.triangles = opencl.allocate(count * self.stride * TRIANGLE_BYTES)
+        self.slots = opencl.allocate(count * self.stride * SLOT_BYTES)
+        self.boxes = opencl.upload(np.full(count * self.stride * 4, LIMIT, np.int32))
+        self.coarse = opencl.upload(np.full(count * vectors * 4, LIMIT, np.int32))
+        self.counters = opencl.upload(np.zeros((count, 32), np.int32))
+        crossing = opencl.allocate(count * self.padded)
+        sizes = (np.int32(mesh.n_face), np.int32(self.padded), np.int32(self.stride), np.int32(cull))
+        screen = (self.triangles, self.slots, self.boxes, self.coarse, crossing, self.counters)
+        path = "render/rasterize.cl"
+        self.steps = {
+            "vertices": opencl.Call(
+                path, "project", (-(-mesh.n_vertex // 64) * 64, count), (64, 1),
+                (self.views, mesh.vertices, self.projected, self.counters, np.int32(mesh.n_vertex)),
+            ),
+            "triangles": opencl.Call(
+                path, "set_up", (-(-(self.padded // 16) // 8) * 8, count), (8, 1),
+                (self.views, self.projected, mesh.faces, mesh.tags, *screen, *sizes),
+            ),
+            "cut triangles": opencl.Call(
+                path, "cut_faces", (count,), (1,), (self.views, mesh.vertices, mesh.faces, mesh.tags, *screen, *sizes)
+            ),
+        }  # fmt: skip
+
+    def aim(self, cameras: Sequence[Camera], *, taken: int) -> None:
+        """Set the cameras and put the set-up of all triangles into the queue.
+
+        Args:
+            cameras: `count` of them.
+            taken: layers that the tiles begin with.
+        """
+        texels = 0
+        for i, (r, camera) in enumerate(zip(self._records, cameras, strict=True)):
+            r["eye"], r["axes"] = camera.eye.double().numpy(), camera.axes.double().numpy()
+            r["pixel_size"], r["near"] = camera.pixel_size, camera.near
+            r["width"], r["height"] = camera.width, camera.height
+            r["perspective"] = camera.projection == "perspective"
+            r["vertices"], r["slots"] = i * self.mesh.n_vertex, i * self.stride
+            r["texels"] = texels
+            texels += camera.width * camera.height
+        counters = np.zeros((self.count, 32), np.int32)
+        counters[:, 0] = taken
+        opencl.write(self.views, self._records)
+        opencl.write(self.counters, counters)
+        for step in self.steps.values():
+            step()
+
+    def counts(self) -> list[dict[str, int]]:
+        """Wait, and return what each view did."""
+        found = opencl.fetch(self.counters, np.zeros((self.count, 32), np.int32))
+        return [dict(zip(COUNTERS, row.tolist(), strict=False)) for row in found]
+
+    def room_for_cuts(self) -> int:
+        """Return triangles that cut faces may become."""
+        return self.stride - self.padded
+
+
+class DeviceRaster:
+    """All layers of a mesh from one camera, again and again; as many as there are."""
+
+    def __init__(self, mesh: DeviceMesh, width: int, height: int):
+        """Make room for pictures of width x height pixels."""
+        self._mesh, self._size, self._extra, self._cut_room = mesh, (width, height), 4096, 0
+        self._make()
+
+    def _make(self) -> None:
+        width, height = self._size
+        self.views = DeviceViews(self._mesh, 1, cut_room=self._cut_room)
+        self._taken = -(-width // TILE) * -(-height // TILE) * STAMPS * ROOM
+        self._capacity = self._taken + self._extra
+        n_stamp = -(-width // 4) * -(-height // 4)
+        self._begin, self._layers = opencl.allocate(4 * n_stamp), opencl.allocate(4 * n_stamp)
+        self._key, self._slot = (opencl.allocate(64 * self._capacity) for _ in range(2))
+        v = self.views
+        self._fill = opencl.Call(
+            "render/rasterize.cl", "fill_tiles", (opencl.units(),), (1,),
+            (v.views, v.triangles, v.boxes, v.coarse, v.counters, np.int32(v.stride), np.int32(self._capacity),
+             self._begin, self._layers, self._key, self._slot),
+        )  # fmt: skip
+
+    def draw(self, camera: Camera) -> None:
+        """Fill the picture of `camera` and wait for it."""
+        while True:
+            self.views.aim([camera], taken=self._taken)
+            self._fill()
+            count = self.views.counts()[0]
+            if count["used"] <= self._capacity and count["slots"] <= self.views.room_for_cuts():
+                return
+            self._extra = max(self._extra, 2 * (count["used"] - self._taken))
+            self._cut_room = max(self._cut_room, count["slots"])
+            self._make()
+
+    def lists(self, camera: Camera) -> DeviceLists:
+        """Draw, and return the fragments."""
+        self.draw(camera)
+        width, height = self._size
+        across, down = -(-width // 4), -(-height // 4)
+        begin, layers = (opencl.fetch(x, np.zeros(across * down, np.int32)) for x in (self._begin, self._layers))
+        key = opencl.fetch(self._key, np.zeros((self._capacity, 16), np.float32))
+        slot = opencl.fetch(self._slot, np.zeros((self._capacity, 16), np.int32))
+        faces = opencl.fetch(self.views.slots, np.zeros((self.views.stride, SLOT_BYTES // 4), np.int32))[:, 12]
+        stamp = np.repeat(np.arange(across * down), layers)
+        layer = np.arange(len(stamp)) - np.repeat(np.cumsum(layers) - layers, layers)
+        key, slot = key[begin[stamp] + layer], slot[begin[stamp] + layer]
+        lane = np.arange(16)
+        x, y = 4 * (stamp % across)[:, None] + lane % 4, 4 * (stamp // across)[:, None] + lane // 4
+        there = np.isfinite(key)
+        pixel = (y * width + x)[there]
+        order = np.argsort(pixel, kind="stable")
+        pixel, face = torch.from_numpy(pixel[order]), torch.from_numpy(faces[slot[there][order]]).long()
+        q = torch.from_numpy(key[there][order])
+        if camera.projection == "orthographic":
+            return DeviceLists(pixel, face, q)
+        xy = torch.stack([pixel % width, pixel // width], -1) + 0.5
+        return DeviceLists(pixel, face, (-camera.rays(xy.double())[2] / q).float())

@@ -63,7 +63,7 @@ SLOPE_BIAS, STEEPEST = 2.0, 0.03
 
 def build(scene: Scene, world: World, light: Light, *, size: int, silhouette: Silhouette) -> ShadowMap:
     """Return the shadow map of `light`: size x size texels (half of that for each face of a point light)."""
-    return ShadowMap(tuple(_draw(scene, world, camera, silhouette) for camera in _cameras(world, light, size)))
+    return ShadowMap(tuple(_draw(scene, world, camera, silhouette) for camera in cameras(world, light, size)))
 
 
 def blocked(shadow: ShadowMap, position: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
@@ -116,7 +116,7 @@ def _draw(scene: Scene, world: World, camera: Camera, silhouette: Silhouette) ->
     return ShadowFace(camera, triangle, offset, layers.triangles)
 
 
-def _cameras(world: World, light: Light, size: int) -> list[Camera]:
+def cameras(world: World, light: Light, size: int) -> list[Camera]:
     """Return the views from a light: one around all of the scene, one along a cone, or six faces of a cube."""
     corners = world.vertices.double()
     if isinstance(light, DirectionalLight):

@@ -206,7 +206,7 @@ def _test_paper(ends: _Ends) -> _Verdict:
     d_front[fronts[wanted]] = front.select(wanted).depth(closely=thin_front[wanted])
     thin_back = thin[backs].nonzero()[:, 0]
     d_back[backs[thin_back]] = back.select(thin_back).depth(closely=torch.ones(len(thin_back), dtype=torch.bool))
-    hit = d_front + d_back <= ends.t_back - ends.t_front
+    hit = (d_front + d_back <= ends.t_back - ends.t_front) | ~has_front  # the eye inside sees the inside
     return _Verdict(hit, d_front, int((~thin).sum()))
 
 

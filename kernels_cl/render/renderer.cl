@@ -1,0 +1,400 @@
+// A frame: tiles of the camera's picture are filled, tested and shaded while they lie in the cache.
+// Host: torchmeso/render/renderer.py
+//
+// Compiled with SILHOUETTE (see silhouette.clh) and ONE_LAYER.
+
+#include "data/eigen_btf.clh"
+#include "render/silhouette.clh"
+#include "render/shadow_map.clh"
+
+// What a frame asks for.
+typedef struct {
+    int lights, ambient_paper, depths, outputs;  // outputs: OWNER also writes depth, objects and shadows
+    int capacity, tiles_capacity, stride, pitch;  // pitch: pixels of a row of the picture
+    float ambient, background[3], rank_error;
+    int pad[3];
+} Frame;
+#define OWNER 1
+#define DISPLAY 2  // writes bytes to be shown, and nothing else
+
+// A light, and where its shadow map lies.
+typedef struct {
+    int kind;  // 0 directional, 1 point, 2 spot
+    int faces, first_face;
+    float inner, outer;  // cosines of the cone
+    float place[3];      // direction towards the light, or position
+    float axis[3], power[3];
+    int pad[2];
+} Light;
+
+typedef struct {
+    Surface at;
+    Vector3 position;
+    Ints object;
+    Floats depth;
+    int seen, inside;
+} Seen;
+
+// Radiance of the points of one object in the lanes `bits`, added to `rgb`.
+static void shade_object(const Place *place, __global const Reflectance *reflectance, __global const Light *lights,
+                         __global const Frame *frame, const Rays *rays, const Seen *seen, const int bits,
+                         const int *blocked, float4 *rgb, int *spared)
+{
+    __global const uchar *tables = place->tables;
+    const Vector3 towards = {-rays->direction.x, -rays->direction.y, -rays->direction.z};
+    const Vector3 wo = to_local(&seen->at, towards);
+    const float4 albedo = {reflectance->albedo[0], reflectance->albedo[1], reflectance->albedo[2], 0.0f};
+    Footprint view;
+    Taps taps;
+    if (reflectance->there) {
+        view = footprint(TABLE(Ring, tables, reflectance->view_rings), reflectance->view_count, wo);
+        taps = bilinear(seen->at.u, seen->at.v, reflectance->height, reflectance->width);
+    }
+    LookUp look_up;
+    if (reflectance->there) {
+        for (int k = 0; k < 4; k++) {
+            look_up.view_node[k].vector = view.node[k];
+            look_up.view_share[k].vector = view.weight[k];
+            look_up.texel[k].vector = taps.texel[k];
+            look_up.texel_share[k].vector = taps.weight[k];
+        }
+        for (int b = bits; b; b &= b - 1) {
+            const int l = __builtin_ctz(b);
+            look_up.first[l] = view_weights(tables, reflectance, 0, &look_up, l);
+        }
+    }
+    int lit = 0;
+
+    for (int i = 0; i < frame->lights; i++) {
+        __global const Light *light = lights + i;
+        Vector3 wi_world;
+        float16 falloff = 1.0f;
+        if (light->kind == 0) {
+            wi_world.x = light->place[0], wi_world.y = light->place[1], wi_world.z = light->place[2];
+        } else {
+            const Vector3 way = {light->place[0] - seen->position.x, light->place[1] - seen->position.y,
+                                 light->place[2] - seen->position.z};
+            falloff = 1.0f / MAX(dot3(way, way), (float16)1e-12f);
+            wi_world = normalize3(way);
+            if (light->kind == 2) {
+                const float16 cosine = -(light->axis[0] * wi_world.x + light->axis[1] * wi_world.y +
+                                         light->axis[2] * wi_world.z);
+                float16 x = (cosine - light->outer) / MAX(light->inner - light->outer, 1e-6f);
+                x = x > 1.0f ? 1.0f : x;
+                x = x > 0.0f ? x : 0.0f;
+                falloff *= x * x * (3.0f - 2.0f * x);
+            }
+        }
+        const Vector3 wi = to_local(&seen->at, wi_world);
+        const float4 power = {light->power[0], light->power[1], light->power[2], 0.0f};
+        const float most = MAX(MAX(power.x, power.y), power.z);
+        const int arrives = bits & ~blocked[i] & to_bits((wi.z > 0.0f) & (falloff * most > 0.0f));
+        lit |= arrives;
+        if (!arrives) continue;
+        if (!reflectance->there) {
+            const float16 share = falloff * wi.z * (1.0f / PI);
+            const Floats part = {share};
+            for (int b = arrives; b; b &= b - 1) {
+                const int l = __builtin_ctz(b);
+                rgb[l] += power * albedo * part.lane[l];
+            }
+            continue;
+        }
+        const Footprint from = footprint(TABLE(Ring, tables, reflectance->light_rings), reflectance->light_count, wi);
+        const Ints light_node[4] = {{from.node[0]}, {from.node[1]}, {from.node[2]}, {from.node[3]}};
+        const Floats light_share[4] = {{from.weight[0]}, {from.weight[1]}, {from.weight[2]}, {from.weight[3]}};
+        float16 horizon = wi.z / reflectance->last_cosine;
+        horizon = horizon > 1.0f ? 1.0f : horizon;
+        const Floats arriving = {falloff * horizon * (1.0f / PI)};
+        for (int b = arrives; b; b &= b - 1) {
+            const int l = __builtin_ctz(b);
+            const float4 T = reflect(tables, reflectance, frame->rank_error, &look_up, light_node, light_share, l, spared);
+            rgb[l] += T * power * arriving.lane[l];
+        }
+    }
+
+    const int dark = frame->ambient_paper ? bits & ~lit : bits;
+    if (frame->ambient <= 0.0f || !dark) return;
+    if (!reflectance->there) {
+        for (int b = dark; b; b &= b - 1) rgb[__builtin_ctz(b)] += frame->ambient * albedo;
+        return;
+    }
+    for (int b = dark; b; b &= b - 1) {
+        const int l = __builtin_ctz(b);
+        rgb[l] += frame->ambient * reflect_ambient(tables, reflectance, &look_up, l);
+    }
+}
+
+// What the rays of a stamp end on: the nearest of all stretches that stop them.
+static Seen look(const Place *place, const Rays *rays, __global const float16 *key, __global const int16 *slot,
+                 const int filled, const int lanes, const int depths, Tally *tally)
+{
+    Seen seen;
+    seen.depth.vector = INFINITY;
+    seen.object.vector = -1;
+    seen.seen = seen.inside = 0;
+    Ints next;
+    next.vector = 0;
+    int active = lanes, first_round = 1, first_seen = 1;
+    while (active) {
+        Stretches found;
+        const int candidates = next_stretches(place, rays, key, slot, filled, &active, &next, &seen.depth, first_round, &found,
+                                              tally);
+        first_round = 0;
+        if (!candidates) break;
+        int hit = candidates;
+        const float16 length = found.t_back.vector - found.t_front.vector;
+        const Surface s = surface_at(place, rays, candidates & ~found.inside, found.front);
+        Floats reach;  // d_f; negative: to be asked
+        reach.vector = -1.0f;
+#if SILHOUETTE != 0
+        const int thin = thin_lanes(place, rays, candidates & ~found.inside & ~found.single, &found, &s, 1, tally);
+        hit &= ~thin;
+#endif
+#if SILHOUETTE == 1
+        if (thin) hit |= test_paper(place, rays, thin, &found, &s, 1, &reach, tally);
+#elif SILHOUETTE == 2
+        Floats at;
+        at.vector = INFINITY;
+        if (thin) {
+            int unmarched = 0, holes = 0;
+            hit |= test_curved(place, rays, thin, &found, &s, 1, &at, &unmarched, tally);
+            for (int rest = unmarched; rest; rest &= rest - 1) {
+                const int l = __builtin_ctz(rest);
+                if (place->mdfs[found.object.lane[l]].missing >= 0) holes |= 1 << l;
+            }
+            if (holes) hit = (hit & ~holes) | test_paper(place, rays, holes, &found, &s, 1, &reach, tally);
+        }
+#endif
+        tally->carved += __builtin_popcount(candidates & ~hit);
+        tally->inside += __builtin_popcount(hit & found.inside);
+        if (!hit) continue;
+
+        const int solid = hit & ~found.inside;
+        float16 d = 0.0f;
+#if SILHOUETTE != 0
+        // How deep the mesostructure lies is asked where it is written, or where it decides what is in front.
+        int asked = depths ? solid : solid & (found.crowded | found.single);
+        asked &= ~to_bits(reach.vector >= 0.0f);
+        const Vector3 towards = {-rays->direction.x, -rays->direction.y, -rays->direction.z};
+        const Vector3 wo = to_local(&s, towards);
+        int fronts = 0;
+        for (int rest = asked & found.single; rest; rest &= rest - 1) {
+            const int l = __builtin_ctz(rest);
+            if (place->slots[found.front.lane[l]].tag & FRONT) fronts |= 1 << l;
+        }
+        asked = (asked & ~found.single) | fronts;
+        d = reach.vector >= 0.0f ? reach.vector : 0.0f;
+        while (asked) {
+            const int object = found.object.lane[__builtin_ctz(asked)];
+            __global const Mdf *mdf = place->mdfs + object;
+            int same = 0;
+            for (int rest = asked; rest; rest &= rest - 1) {
+                const int l = __builtin_ctz(rest);
+                same |= found.object.lane[l] == object ? 1 << l : 0;
+            }
+            asked &= ~same;
+            if (!mdf->there) continue;
+            tally->looked += __builtin_popcount(same);
+            float16 D = s.scale * mdf_distance(place->tables, mdf, same, s.u, s.v, wo);
+            // A ray without a hit ends at the bottom of an open surface's slab.
+            const float16 lowest = s.scale * mdf->h / MAX(wo.z, (float16)MIN_COS);
+            D = from_bits(found.single) & (D == INFINITY) ? lowest : D;
+            d = from_bits(same) ? D : d;
+        }
+#if SILHOUETTE == 2
+        const int16 interval = ~from_bits(found.single) & (reach.vector < 0.0f);
+        d = interval & (d > length) ? length : d;
+        d = interval & (at.vector < d) ? at.vector : d;
+#endif
+#endif
+        const float16 depth = found.t_front.vector + d;
+        const int16 better = from_bits(hit) & (depth < seen.depth.vector);
+        const int bits = to_bits(better);
+        seen.seen |= bits;
+        seen.inside = (seen.inside & ~bits) | (found.inside & bits);
+        seen.depth.vector = better ? depth : seen.depth.vector;
+        seen.object.vector = better ? found.object.vector : seen.object.vector;
+        const float16 t = found.t_front.vector;
+        const Vector3 position = {rays->origin.x + t * rays->direction.x, rays->origin.y + t * rays->direction.y,
+                                  rays->origin.z + t * rays->direction.z};
+        if (first_seen) {
+            seen.at = s;
+            seen.position = position;
+            first_seen = 0;
+        } else {
+            Floats *to = (Floats *)&seen.at;
+            const Floats *from = (const Floats *)&s;
+            for (int k = 0; k < (int)(sizeof(Surface) / sizeof(float16)); k++)
+                to[k].vector = better ? from[k].vector : to[k].vector;
+            seen.position.x = better ? position.x : seen.position.x;
+            seen.position.y = better ? position.y : seen.position.y;
+            seen.position.z = better ? position.z : seen.position.z;
+        }
+        // Nothing begins within the interval: what comes later lies behind.
+        const int resolved = hit & ~found.crowded & ~found.single;
+        active &= ~resolved;
+    }
+    return seen;
+}
+
+// Four colours as they are shown: exposure 0, clipped, sRGB, as data/image.py does; log2 and 2^x are polynomials.
+static uchar16 encode(const float16 colour)
+{
+    float16 x = colour > 0.0f ? colour : (float16)0.0f;
+    x = x < 1.0f ? x : (float16)1.0f;
+    const int16 bits = as_int16(x + 1e-9f);
+    const float16 m = as_float16((bits & 0x7fffff) | 0x3f800000) - 1.0f;
+    float16 log2 = -0.0248255360f;
+    log2 = log2 * m + 0.1179165680f;
+    log2 = log2 * m - 0.2723536420f;
+    log2 = log2 * m + 0.4538504450f;
+    log2 = log2 * m - 0.7169698550f;
+    log2 = log2 * m + 1.4423896250f;
+    log2 = (TO_FLOAT((bits >> 23) - 127) + m * log2) * (1.0f / 2.4f);
+    const int16 whole = TO_INT(log2 - 0.5f);
+    const float16 f = log2 - TO_FLOAT(whole);
+    float16 exp2 = 1.8775767e-3f;
+    exp2 = exp2 * f + 8.9893397e-3f;
+    exp2 = exp2 * f + 5.5826318e-2f;
+    exp2 = exp2 * f + 2.4015361e-1f;
+    exp2 = exp2 * f + 6.9315308e-1f;
+    exp2 = exp2 * f + 9.9999994e-1f;
+    const float16 power = 1.055f * exp2 * as_float16((whole + 127) << 23) - 0.055f;
+    float16 shown = x <= 0.0031308f ? 12.92f * x : power;
+    shown.s3 = x.s3, shown.s7 = x.s7, shown.sb = x.sb, shown.sf = x.sf;
+    return __builtin_convertvector(TO_INT(shown * 255.0f + 0.5f), uchar16);
+}
+
+static void draw_stamp(const Place *place, __global const Frame *frame, __global const Reflectance *reflectances,
+                       __global const Light *lights, const Shadows *shadows, const Rays *rays, const int lanes,
+                       const Seen *seen, __global uchar4 *shown, __global float4 *rgba, __global float *depth, __global int *owner,
+                       __global uchar *shadowed, int *spared)
+{
+    const int shaded = seen->seen & ~seen->inside;
+    const int plane = frame->pitch * ((place->view->height + 3) & ~3);
+    float4 colour[16];  // rgb and whether an object is seen
+    const float4 background = {frame->background[0], frame->background[1], frame->background[2], 0.0f};
+    for (int l = 0; l < 16; l++) colour[l] = seen->seen >> l & 1 ? (float4)(0.0f, 0.0f, 0.0f, 1.0f) : background;
+    int blocked[MAX_LIGHTS];
+    const float16 d = from_bits(shaded) ? seen->depth.vector : (float16)0.0f;
+    const Vector3 receiver = {rays->origin.x + d * rays->direction.x, rays->origin.y + d * rays->direction.y,
+                              rays->origin.z + d * rays->direction.z};
+    for (int i = 0; i < frame->lights; i++) {
+        blocked[i] = shaded ? blocked_from(shadows, lights[i].first_face, lights[i].faces, &receiver, shaded) : 0;
+        if (!(frame->outputs & OWNER)) continue;
+        for (int l = 0; l < 16; l++)
+            shadowed[i * plane + (rays->y + (l >> 2)) * frame->pitch + rays->x + (l & 3)] = blocked[i] >> l & 1;
+    }
+    for (int rest = shaded; rest;) {
+        const int object = seen->object.lane[__builtin_ctz(rest)];
+        int same = 0;
+        for (int b = rest; b; b &= b - 1) {
+            const int l = __builtin_ctz(b);
+            same |= seen->object.lane[l] == object ? 1 << l : 0;
+        }
+        shade_object(place, reflectances + object, lights, frame, rays, seen, same, blocked, colour, spared);
+        rest &= ~same;
+    }
+    const Ints objects = {from_bits(seen->inside) ? (int16)-2 : seen->object.vector};
+    for (int row = 0; row < 4; row++) {
+        const int first = (rays->y + row) * frame->pitch + rays->x;
+        if (frame->outputs & DISPLAY) {
+            *(__global uchar16 *)(shown + first) = encode(*(const float16 *)(colour + 4 * row));
+            continue;
+        }
+        for (int k = 0; k < 4; k++) rgba[first + k] = colour[4 * row + k];
+        if (frame->outputs & OWNER) {
+            *(__global float4 *)(depth + first) = *(const float4 *)(seen->depth.lane + 4 * row);
+            *(__global int4 *)(owner + first) = *(const int4 *)(objects.lane + 4 * row);
+        }
+    }
+}
+
+// A stamp where nothing is seen.
+static void clear_stamp(__global const Frame *frame, const int plane, const int x, const int y, const float4 background,
+                        const uchar16 shown_background, __global uchar4 *shown, __global float4 *rgba,
+                        __global float *depth, __global int *owner, __global uchar *shadowed)
+{
+    for (int row = 0; row < 4; row++) {
+        const int first = (y + row) * frame->pitch + x;
+        if (frame->outputs & DISPLAY) {
+            *(__global uchar16 *)(shown + first) = shown_background;
+            continue;
+        }
+        for (int k = 0; k < 4; k++) rgba[first + k] = background;
+        if (frame->outputs & OWNER) {
+            *(__global float4 *)(depth + first) = INFINITY;
+            *(__global int4 *)(owner + first) = -1;
+            for (int i = 0; i < frame->lights; i++)
+                for (int k = 0; k < 4; k++) shadowed[i * plane + first + k] = 0;
+        }
+    }
+}
+
+__kernel __attribute__((reqd_work_group_size(1, 1, 1)))
+void draw(__global const View *restrict view, __global const Triangle *restrict triangles,
+          __global const Slot *restrict slots,
+          __global const int16 *restrict boxes, __global const int16 *restrict coarse,
+          __global Counters *restrict counters, __global const int *restrict faces,
+          __global const float16 *restrict records, __global const Facet *restrict facets,
+          __global const uchar *restrict tables, __global const Mdf *restrict mdfs,
+          __global const Reflectance *restrict reflectances, __global const Light *restrict lights,
+          __global const View *restrict light_views, __global const Slot *restrict light_slots,
+          __global const Triangle *restrict light_triangles, __global const Texel *restrict texels,
+          __global const Frame *restrict frame,
+          __global float16 *restrict key, __global int16 *restrict slot,  // layers of the tiles at work
+          __global uchar4 *restrict shown,     // (H, pitch) sRGB, and 255 where an object is seen
+          __global float4 *restrict rgba,      // (H, pitch) linear colour, and whether an object is seen
+          __global float *restrict depth,      // (H, pitch)
+          __global int *restrict owner,        // (H, pitch)
+          __global uchar *restrict shadowed,   // (light, H, pitch)
+          __global int *restrict empty)        // (tiles) whether a tile already shows the background
+{
+    const Place place = {view, slots, faces, records, facets, tables, mdfs, counters->behind_near};
+    const Shadows shadows = {light_views, light_slots, light_triangles, texels};
+    const int across = (view->width + TILE - 1) / TILE, down = (view->height + TILE - 1) / TILE;
+    Lists lists;
+    Tally tally = {0};
+    int spared = 0, skipped = 0;
+    const float4 background = {frame->background[0], frame->background[1], frame->background[2], 0.0f};
+    const uchar16 shown_background = encode((float16)(background, background, background, background));
+    const int plane = frame->pitch * ((view->height + 3) & ~3);
+    while (1) {
+        const int tile = atomic_inc(&counters->tile);
+        if (tile >= across * down) break;
+        const int x0 = tile % across * TILE, y0 = tile / across * TILE;
+        const int room = get_group_id(0) * ROOM * STAMPS * STAMPS;
+        if (!fill_tile(view, triangles, boxes, coarse, counters->vectors, frame->stride >> 4, x0, y0, room, &lists, key,
+                       slot, &counters->used, frame->capacity))
+            continue;  // the host gives more room and asks again
+        int covered = 0;
+        for (int s = 0; s < STAMPS * STAMPS; s++) covered |= lists.filled[s];
+        if (!covered && empty[tile]) {
+            skipped++;
+            continue;
+        }
+        empty[tile] = !covered;
+        for (int s = 0; s < STAMPS * STAMPS; s++) {
+            const int x = x0 + 4 * (s % STAMPS), y = y0 + 4 * (s / STAMPS);
+            if (x >= view->width || y >= view->height) continue;
+            const int filled = lists.filled[s];
+            if (!filled) {
+                clear_stamp(frame, plane, x, y, background, shown_background, shown, rgba, depth, owner, shadowed);
+                continue;
+            }
+            const Rays rays = stamp_rays(view, x, y);
+            const int lanes = to_bits((x + LX < view->width) & (y + LY < view->height));
+            __global const float16 *key_of = key + lists.begin[s];
+            tally.covered += __builtin_popcount(lanes & to_bits(key_of[0] < INFINITY));
+            tally.deepest = MAX(tally.deepest, filled);
+            for (int k = 0; k < filled; k++) tally.fragments += __builtin_popcount(to_bits(key_of[k] < INFINITY));
+            const Seen seen = look(&place, &rays, key_of, slot + lists.begin[s], filled, lanes, frame->depths, &tally);
+            draw_stamp(&place, frame, reflectances, lights, &shadows, &rays, lanes, &seen, shown, rgba, depth, owner,
+                       shadowed, &spared);
+        }
+    }
+    count_up(counters, &tally);
+    atomic_add(&counters->spared, spared);
+    atomic_add(&counters->empty_tiles, skipped);
+}

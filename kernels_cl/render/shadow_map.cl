@@ -1,0 +1,124 @@
+// The light's pass: which triangle the nearest shadow starts on, and how far behind it.
+// Host: torchmeso/render/shadow_map.py
+//
+// Compiled with SILHOUETTE (see silhouette.clh).
+
+#include "render/silhouette.clh"
+#include "render/shadow_map.clh"
+
+// Keeps what stops the light nearest: closed surfaces where the ray leaves them, open ones at the base of their slab.
+static void block_stamp(const Place *place, const Rays *rays, __global const float16 *key, __global const int16 *slot,
+                        const int filled, const int lanes, Ints *nearest, Floats *behind, Tally *tally)
+{
+    Floats start;
+    start.vector = INFINITY;
+    Ints next;
+    next.vector = 0;
+    const float size = (float)place->view->pixel_size;
+    int active = lanes, first_round = 1;
+    while (active) {
+        Stretches found;
+        const int candidates = next_stretches(place, rays, key, slot, filled, &active, &next, &start, first_round, &found,
+                                              tally);
+        first_round = 0;
+        if (!candidates) break;
+        // A light inside a solid lights that solid's surroundings; what nothing closes is taken at its front.
+        int hit = candidates & ~found.inside;
+        const int16 closed = found.back.vector >= 0;
+        const Ints surface = {closed ? found.back.vector : found.front.vector};
+        const float16 t = closed ? found.t_back.vector : found.t_front.vector;
+        const Surface s = surface_at(place, rays, hit, surface);
+#if SILHOUETTE != 0
+        const int thin = thin_lanes(place, rays, hit & ~found.single, &found, &s, 0, tally);
+        hit &= ~thin;
+#endif
+#if SILHOUETTE == 1
+        Floats reach;
+        if (thin) hit |= test_paper(place, rays, thin, &found, &s, 0, &reach, tally);
+#elif SILHOUETTE == 2
+        if (thin) {
+            Floats at, reach;
+            at.vector = INFINITY;
+            int unmarched = 0, holes = 0;
+            hit |= test_curved(place, rays, thin, &found, &s, 0, &at, &unmarched, tally);
+            for (int rest = unmarched; rest; rest &= rest - 1) {
+                const int l = __builtin_ctz(rest);
+                if (place->mdfs[found.object.lane[l]].missing >= 0) holes |= 1 << l;
+            }
+            if (holes) hit = (hit & ~holes) | test_paper(place, rays, holes, &found, &s, 0, &reach, tally);
+        }
+#endif
+        tally->carved += __builtin_popcount(candidates & ~found.inside & ~hit);
+        if (!hit) continue;
+        const float16 cosine = -dot3(s.n, rays->direction);
+        const float16 lean = magnitude(cosine), steep = MAX(lean, (float16)STEEPEST);
+        const float16 texel = place->view->perspective ? size * t : (float16)size;
+        const float16 bias = texel * (1.0f + SLOPE_BIAS * root(MAX(1.0f - steep * steep, (float16)0.0f)) / steep);
+        Floats slab;
+        slab.vector = 0.0f;
+#if SILHOUETTE != 0
+        for (int rest = hit & ~to_bits(closed); rest; rest &= rest - 1) {
+            const int l = __builtin_ctz(rest);
+            __global const Mdf *mdf = place->mdfs + found.object.lane[l];
+            if (mdf->there && place->slots[surface.lane[l]].tag & FRONT) slab.lane[l] = mdf->h;
+        }
+#endif
+        const float16 base = s.scale * slab.vector / MAX(cosine, (float16)MIN_COS) + bias;
+        const float16 half_way = 0.5f * (t - found.t_front.vector);
+        const float16 offset = closed ? -MIN(bias, half_way) : base;
+        const int16 better = from_bits(hit) & (t + offset < start.vector);
+        start.vector = better ? t + offset : start.vector;
+        nearest->vector = better ? surface.vector : nearest->vector;
+        behind->vector = better ? offset : behind->vector;
+    }
+}
+
+__kernel __attribute__((reqd_work_group_size(1, 1, 1)))
+void draw_light(__global const View *restrict views, __global const Triangle *restrict triangles,
+                __global const Slot *restrict slots,
+                __global const int16 *restrict boxes, __global const int16 *restrict coarse,
+                __global Counters *restrict counters, __global const int *restrict faces,
+                __global const float16 *restrict records, __global const Facet *restrict facets,
+                __global const uchar *restrict tables, __global const Mdf *restrict mdfs, const int number,
+                const int stride, const int capacity,
+                __global float16 *restrict key, __global int16 *restrict slot,  // layers of the tiles at work
+                __global Texel *restrict texels)
+{
+    __global const View *view = views + number;
+    __global Counters *counted = counters + number;
+    const int coarse_stride = ((stride >> 4) + 15) >> 4;
+    const Place place = {view, slots + view->slots, faces, records, facets, tables, mdfs,
+                         counted->behind_near};
+    const int across = (view->width + TILE - 1) / TILE, down = (view->height + TILE - 1) / TILE;
+    Lists lists;
+    Tally tally = {0};
+    while (1) {
+        const int tile = atomic_inc(&counted->tile);
+        if (tile >= across * down) break;
+        const int x0 = tile % across * TILE, y0 = tile / across * TILE;
+        const int room = get_group_id(0) * ROOM * STAMPS * STAMPS;
+        if (!fill_tile(view, triangles + view->slots, boxes + 4 * (view->slots >> 4), coarse + number * 4 * coarse_stride,
+                       counted->vectors, stride >> 4, x0, y0, room, &lists, key, slot, &counted->used, capacity))
+            continue;  // the host gives more room and asks again
+        for (int s = 0; s < STAMPS * STAMPS; s++) {
+            const int x = x0 + 4 * (s % STAMPS), y = y0 + 4 * (s / STAMPS);
+            if (x >= view->width || y >= view->height) continue;
+            Ints nearest;
+            Floats behind;
+            nearest.vector = -1;
+            behind.vector = 0.0f;
+            const int filled = lists.filled[s], lanes = to_bits((x + LX < view->width) & (y + LY < view->height));
+            if (filled) {
+                const Rays rays = stamp_rays(view, x, y);
+                block_stamp(&place, &rays, key + lists.begin[s], slot + lists.begin[s], filled, lanes, &nearest, &behind,
+                            &tally);
+            }
+            for (int rest = lanes; rest; rest &= rest - 1) {
+                const int l = __builtin_ctz(rest);
+                const Texel texel = {nearest.lane[l], behind.lane[l]};
+                texels[view->texels + (y + (l >> 2)) * view->width + x + (l & 3)] = texel;
+            }
+        }
+    }
+    count_up(counted, &tally);
+}

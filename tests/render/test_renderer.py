@@ -1,0 +1,182 @@
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from tests.render.scenes import camera, sun
+from torchmeso.compress import eigen
+from torchmeso.compress.eigen import EigenOptions
+from torchmeso.data import eigen_btf
+from torchmeso.errors import BackendError
+from torchmeso.geometry import hemisphere, mesh, shapes
+from torchmeso.geometry.light import PointLight, SpotLight
+from torchmeso.meso import bake_btf, bake_mdf, generators
+from torchmeso.meso.bake_btf import BtfOptions
+from torchmeso.meso.bake_mdf import MdfOptions, RayCastMdf
+from torchmeso.render import frame
+from torchmeso.render.frame import FrameOptions
+from torchmeso.render.renderer import Renderer
+from torchmeso.render.scene import Material, Object, Scene
+
+
+def moved(shape, x=0.0, y=0.0, z=0.0):
+    matrix = torch.eye(4)
+    matrix[:3, 3] = torch.tensor([x, y, z])
+    return mesh.transform(shape, matrix)
+
+
+@pytest.fixture(scope="module")
+def brick():
+    """A brick wall of both tables, small."""
+    meso = generators.brick()
+    lights = views = "grid(8, 3, 80)"
+    table = bake_btf.in_memory(meso, BtfOptions(texels=16, lights=lights, views=views, samples=1, bounces=0))
+    model = eigen.fit(table, EigenOptions(rank=6))
+    return Material(btf=model, mdf=bake_mdf.in_memory(meso, MdfOptions(texels=32, views="grid(8, 4, 87.5)")))
+
+
+@pytest.fixture(scope="module")
+def weave():
+    """A material with holes, without a BTF."""
+    options = MdfOptions(texels=32, views="grid(8, 4, 87.5)")
+    return Material(mdf=bake_mdf.in_memory(generators.weave(), options), albedo=(0.7, 0.5, 0.3))
+
+
+@pytest.fixture(scope="module")
+def still_life(brick, weave):
+    """Two bodies and an open floor, a plain and two textured materials."""
+    return (
+        Object(mesh=moved(shapes.torus(tiles=(6, 2), triangles=600), y=0.3), material=brick),
+        Object(mesh=moved(shapes.sphere(radius=0.4, triangles=300), y=0.4), material=Material(albedo=(0.9, 0.2, 0.1))),
+        Object(mesh=moved(shapes.cylinder(radius=0.3, height=0.8, tiles=(4, 2), triangles=400), x=1.3), material=weave),
+        Object(mesh=moved(shapes.plane(size=(6.0, 6.0), tiles=(4, 4)), y=-0.6), material=brick),
+    )
+
+
+LIGHTS = {
+    "sun": (sun(1, 2, 1),),
+    "point": (PointLight(position=torch.tensor([1.5, 2.0, 1.5]), intensity=torch.full((3,), 20.0)),),
+    "spot": (
+        SpotLight(
+            position=torch.tensor([-1.0, 3.0, 1.0]),
+            axis=torch.nn.functional.normalize(torch.tensor([0.3, -1.0, -0.3]), dim=0),
+            intensity=torch.tensor([40.0, 30.0, 20.0]),
+            outer_deg=35.0,
+        ),
+        sun(-1, 1, 0.2),
+    ),
+    "none": (),
+}
+
+
+def compare(scene, view, options):
+    """Both pictures, and at how many pixels they differ by more than 1/255."""
+    exact, fast = frame.render(scene, view, options), Renderer(scene, options).render(view)
+    differs = (exact.rgb - fast.rgb).abs().amax(-1) > 1 / 255
+    return exact, fast, int(differs.sum())
+
+
+@pytest.mark.parametrize("silhouette", ["none", "paper", "curved"])
+@pytest.mark.parametrize("light", LIGHTS)
+def test_the_same_picture_as_torch(silhouette, light, still_life, device):
+    scene = Scene(objects=still_life, lights=LIGHTS[light], background=(0.1, 0.2, 0.3))
+    view = camera((1.5, 2.0, 3.5), size=96)
+    exact, fast, wrong = compare(scene, view, FrameOptions(silhouette=silhouette, shadow_map_size=128))
+    assert wrong <= 4  # decisions on their threshold
+    assert (exact.owner != fast.owner).sum() <= 2
+    assert (exact.shadowed != fast.shadowed).sum() <= 4
+    near = (exact.depth - fast.depth).abs() <= 1e-4 * exact.depth
+    assert (~near & exact.depth.isfinite()).sum() <= 4
+    for name in ("fragments", "layers", "pixels with a fragment"):
+        assert exact.counts[name] == fast.counts[name], name
+    assert 0 < fast.counts["intervals"] <= exact.counts["intervals"]  # those behind a resolved pixel are skipped
+
+
+@pytest.mark.parametrize("rule", ["add", "paper"])
+@pytest.mark.parametrize("projection", ["perspective", "orthographic"])
+def test_both_cameras_and_ambient_rules(rule, projection, still_life, device):
+    scene = Scene(objects=still_life, lights=LIGHTS["sun"], ambient=0.3, ambient_rule=rule)
+    view = camera((1.5, 2.0, 3.5), size=64, projection=projection, view_height=4.0)
+    assert compare(scene, view, FrameOptions(shadow_map_size=128))[2] <= 3
+
+
+@pytest.mark.parametrize("silhouette", ["paper", "curved"])
+def test_an_eye_inside_a_body_and_under_the_floor(silhouette, still_life, device):
+    scene = Scene(objects=still_life, lights=LIGHTS["sun"])
+    for eye in ((0.0, 0.3, 0.9), (0.0, 0.4, 0.1), (0.0, -2.0, 0.5)):
+        exact, fast, wrong = compare(scene, camera(eye, at=(0.1, 0.0, 0.0)), FrameOptions(silhouette=silhouette))
+        assert wrong <= 4
+        assert torch.equal(exact.owner == -2, fast.owner == -2)
+
+
+@pytest.mark.parametrize("storage", ["uint8", "float16", "float32"])
+def test_every_storage_of_maps(storage, device):
+    table = bake_btf.in_memory(
+        generators.brick(), BtfOptions(texels=8, lights="ubo81", views="grid(6, 3, 80)", samples=1, bounces=0)
+    )
+    material = Material(btf=eigen.fit(table, EigenOptions(rank=9, storage=storage)))
+    objects = (Object(mesh=shapes.sphere(triangles=500), material=material),)
+    assert compare(Scene(objects=objects, lights=LIGHTS["sun"]), camera((0, 0, 4)), FrameOptions())[2] == 0
+
+
+def test_what_a_screen_shows(still_life, device):
+    renderer = Renderer(Scene(objects=still_life, lights=LIGHTS["sun"]), FrameOptions(shadow_map_size=128))
+    view = camera((1.5, 2.0, 3.5))
+    shown = renderer.show(view).clone()
+    picture = renderer.render(view)
+    linear = picture.rgb.clamp(0, 1)
+    srgb = torch.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    assert (shown[..., :3].float() - 255 * srgb).abs().max() <= 0.51 + 0.01
+    assert torch.equal(shown[..., 3] == 255, picture.owner != -1)
+
+
+def test_frame_after_frame(still_life, device):
+    """A picture does not depend on the ones before it."""
+    options = FrameOptions(shadow_map_size=128)
+    scene = Scene(objects=still_life, lights=LIGHTS["sun"])
+    renderer = Renderer(scene, options)
+    views = [camera((1.5, 2.0, 3.5)), camera((-3, 1, 1)), camera((0, 9, 0.1), size=40), camera((1.5, 2.0, 3.5))]
+    for view in views:
+        assert torch.equal(renderer.render(view).rgb, Renderer(scene, options).render(view).rgb)
+    for light in ("point", "spot", "sun"):
+        other = replace(scene, lights=LIGHTS[light])
+        mine, fresh = renderer.render(views[0], LIGHTS[light]), Renderer(other, options).render(views[0])
+        assert torch.equal(mine.rgb, fresh.rgb)
+
+
+def test_shadow_maps_rest_while_the_light_does(still_life, device):
+    renderer = Renderer(Scene(objects=still_life, lights=LIGHTS["sun"]), FrameOptions(shadow_map_size=128))
+    renderer.render(camera((1.5, 2.0, 3.5)))
+    assert renderer.counts["shadow maps drawn"] == 1
+    renderer.render(camera((-3, 1, 1)))
+    assert renderer.counts["shadow maps drawn"] == 0
+    renderer.render(camera((-3, 1, 1)), LIGHTS["spot"])
+    assert renderer.counts["shadow maps drawn"] == 2
+
+
+def test_what_kernels_cannot_read(device):
+    objects = (Object(mesh=shapes.sphere(triangles=100), material=Material(mdf=RayCastMdf(generators.sheet()))),)
+    with pytest.raises(BackendError, match="expected an MDF of 8 bits, got RayCastMdf"):
+        Renderer(Scene(objects=objects, lights=()))
+    many = LIGHTS["sun"] * 65
+    plain = Scene(objects=(Object(mesh=shapes.sphere(triangles=100), material=Material()),), lights=many)
+    with pytest.raises(BackendError, match="at most 64 lights, got 65"):
+        Renderer(plain).render(camera((0, 0, 4)))
+
+
+def test_bounds_of_component_groups_hold(device):
+    """No group of components adds more to T than its bound says."""
+    from torchmeso.render import device as module
+
+    table = bake_btf.in_memory(
+        generators.brick(), BtfOptions(texels=8, lights="grid(6, 3, 80)", views="grid(6, 3, 80)", samples=1, bounces=0)
+    )
+    model = eigen.fit(table, EigenOptions(rank=8))
+    weights = hemisphere.with_pole(model.weights, model.views)
+    bounds = module._bounds(model, weights)
+    E = eigen_btf.EigenBtf.decoded(model).flatten(0, 2)
+    for g in range(2):
+        part = torch.einsum("nkc,vk->vnc", E[:, 4 * g : 4 * g + 4], weights[:, 4 * g : 4 * g + 4])
+        assert (part.abs().amax((1, 2)) <= bounds[:, g] * (1 + 1e-5)).all()
+    assert math.isfinite(float(bounds.max()))

@@ -1,0 +1,265 @@
+"""A scene as the kernels read it: geometry, look-up tables and lights packed into a few buffers.
+
+Everything here is made once per scene: a frame changes cameras and lights only. All tables of all materials stand in
+one buffer, each on a block of 64 bytes, because a kernel's arguments cannot be a list.
+
+Kernels: kernels_cl/render/silhouette.clh, kernels_cl/data/*.clh          Test: tests/render/test_device.py
+"""
+
+import math
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchmeso.backends import opencl
+from torchmeso.data.eigen_btf import EigenBtf
+from torchmeso.data.mdf import Mdf
+from torchmeso.data.relief import CODES as RELIEF_CODES
+from torchmeso.errors import BackendError
+from torchmeso.geometry import hemisphere
+from torchmeso.geometry.directions import normalize
+from torchmeso.geometry.hemisphere import DirectionSet
+from torchmeso.geometry.light import DirectionalLight, Light, SpotLight
+from torchmeso.render.rasterize import DeviceMesh, upload_mesh
+from torchmeso.render.scene import Material, Scene, World
+
+if TYPE_CHECKING:
+    import pyopencl as cl
+
+BLOCK, GROUP = 64, 4
+"""Bytes that tables are aligned to, and components that stand in one vector."""
+
+RECORD = ("n", "t", "uv", "scale", "sign")
+"""What a vertex holds, in this order, in sixteen floats."""
+
+FACET = np.dtype(
+    [("normal", "f4", 3), ("turn", "f4"), ("first", "f4", 3), ("scale", "f4"), ("second", "f4", 3), ("pad", "f4")]
+)
+
+REFLECTANCE = np.dtype(
+    [(name, "i4") for name in ("there", "height", "width", "groups", "codes", "light_rings", "light_count")]
+    + [(name, "i4") for name in ("view_rings", "view_count", "maps", "weights", "scale", "offset", "ambient")]
+    + [("last_cosine", "f4"), ("albedo", "f4", 3), ("pad", "i4", 14)]
+)
+
+MDF = np.dtype(
+    [(name, "i4") for name in ("there", "height", "width", "rings", "ring_count", "delta", "missing")]
+    + [(name, "i4") for name in ("relief_height", "relief_width", "relief", "hole")]
+    + [("h", "f4"), ("delta_max", "f4"), ("pad", "i4", 3)]
+)
+
+LIGHT = np.dtype(
+    [("kind", "i4"), ("faces", "i4"), ("first_face", "i4"), ("inner", "f4"), ("outer", "f4")]
+    + [(name, "f4", 3) for name in ("place", "axis", "power")]
+    + [("pad", "i4", 2)]
+)  # fmt: skip
+
+
+class DeviceScene(NamedTuple):
+    """The buffers of a scene.
+
+    Attributes:
+        mesh: all meshes as one.
+        faces: (F, 3) corners, as `mesh.faces`.
+        records: (V, 16) float32, see `RECORD`.
+        facets: (F,) see `FACET`.
+        tables: everything that is looked up.
+        mdfs: (object,) see `MDF`.
+        reflectances: (object,) see `REFLECTANCE`.
+        textured: whether any object has a mesostructure.
+        nbytes: of all of them.
+    """
+
+    mesh: DeviceMesh
+    records: "cl.Buffer"
+    facets: "cl.Buffer"
+    tables: "cl.Buffer"
+    mdfs: "cl.Buffer"
+    reflectances: "cl.Buffer"
+    textured: bool
+    nbytes: int
+
+
+def upload(scene: Scene, world: World, *, silhouettes: bool, ambient: bool) -> DeviceScene:
+    """Return `scene` on the device.
+
+    Args:
+        scene: materials.
+        world: its meshes as one.
+        silhouettes: whether the mesostructure has depth; without, MDFs are not read.
+        ambient: whether the ambient term is needed.
+
+    Raises:
+        BackendError: there is no device, or a material is of a kind that kernels do not read.
+    """
+    pool = _Pool()
+    shared: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+    reflectances, mdfs = np.zeros(len(scene.objects), REFLECTANCE), np.zeros(len(scene.objects), MDF)
+    for i, item in enumerate(scene.objects):
+        material = item.material
+        if id(material) not in shared:
+            shared[id(material)] = (
+                _reflectance(pool, material, ambient=ambient),
+                _mdf(pool, material.mdf) if silhouettes and material.mdf is not None else np.zeros(1, MDF),
+            )
+        reflectances[i], mdfs[i] = shared[id(material)][0][0], shared[id(material)][1][0]
+    tags = torch.stack([(world.component << 2) | (world.closed[world.component].long() << 1), world.owner], 1)
+    records, facets, tables = vertex_records(world), face_records(world), pool.joined()
+    return DeviceScene(
+        upload_mesh(world.vertices, world.faces, tags),
+        opencl.upload(records),
+        opencl.upload(facets),
+        opencl.upload(tables),
+        opencl.upload(mdfs),
+        opencl.upload(reflectances),
+        bool(mdfs["there"].any()),
+        records.nbytes + facets.nbytes + tables.nbytes,
+    )
+
+
+def vertex_records(world: World) -> Float[np.ndarray, "V 16"]:
+    """Return what is interpolated over a face, per vertex."""
+    records = np.zeros((len(world.vertices), 16), np.float32)
+    parts = (world.normals, world.tangents, world.uv, world.scale[:, None], world.sign[:, None])
+    records[:, :10] = torch.cat([x.float() for x in parts], 1).numpy()
+    return records
+
+
+def face_records(world: World) -> np.ndarray:
+    """Return the plane of each face, how barycentric coordinates grow along it, and how far normals turn from it."""
+    p, n = world.vertices.double()[world.faces], normalize(world.normals.double())[world.faces]
+    e1, e2 = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
+    normal = normalize(torch.linalg.cross(e1, e2))
+    a, b, c = (e1 * e1).sum(-1), (e1 * e2).sum(-1), (e2 * e2).sum(-1)
+    area = (a * c - b * b).clamp(min=1e-30)[:, None]
+    facets = np.zeros(len(world.faces), FACET)
+    facets["normal"] = normal.numpy()
+    facets["first"] = ((c[:, None] * e1 - b[:, None] * e2) / area).numpy()
+    facets["second"] = ((a[:, None] * e2 - b[:, None] * e1) / area).numpy()
+    facets["turn"] = (n - normal[:, None]).norm(dim=-1).amax(1).numpy() + 1e-5
+    facets["scale"] = world.scale[world.faces].amax(1).numpy() * (1 + 1e-6)
+    return facets
+
+
+def light_records(lights: tuple[Light, ...]) -> np.ndarray:
+    """Return the lights; those without shadow maps have no faces."""
+    records = np.zeros(max(len(lights), 1), LIGHT)
+    for r, light in zip(records, lights, strict=False):
+        if isinstance(light, DirectionalLight):
+            r["kind"], r["place"], r["power"] = 0, light.direction.numpy(), light.irradiance.numpy()
+            continue
+        r["kind"], r["place"], r["power"] = 1, light.position.numpy(), light.intensity.numpy()
+        if isinstance(light, SpotLight):
+            r["kind"], r["axis"] = 2, light.axis.numpy()
+            r["inner"], r["outer"] = (math.cos(math.radians(x)) for x in (light.inner_deg, light.outer_deg))
+    return records
+
+
+def _reflectance(pool: "_Pool", material: Material, *, ambient: bool) -> np.ndarray:
+    record = np.zeros(1, REFLECTANCE)
+    btf = material.btf
+    if btf is None:
+        record["albedo"] = material.albedo
+        return record
+    if not isinstance(btf, EigenBtf):
+        raise BackendError(f"opencl: expected an eigen BTF, got {type(btf).__name__}; use the torch backend")
+    groups = -(-btf.rank // GROUP)
+    codes = btf.maps.dtype == torch.uint8
+    height, width = btf.texels
+    maps = hemisphere.with_pole(btf.maps if codes else btf.maps.float(), btf.lights)
+    weights = hemisphere.with_pole(btf.weights.float(), btf.views)
+    scale, offset = _grouped(btf.scale.float()[None])[0], _grouped(btf.offset.float()[None])[0]
+    by_channel = _grouped(weights[:, :, None].expand(-1, -1, 3))
+    by_channel[:, :, 3] = _bounds(btf, weights)
+    record["there"], record["height"], record["width"], record["groups"] = 1, height, width, groups
+    record["codes"] = codes
+    record["light_rings"], record["light_count"] = pool.add(_rings(btf.lights)), _ring_count(btf.lights)
+    record["view_rings"], record["view_count"] = pool.add(_rings(btf.views)), _ring_count(btf.views)
+    record["maps"] = pool.add(_grouped(maps.flatten(0, 2)).numpy())
+    record["weights"], record["scale"], record["offset"] = (pool.add(x.numpy()) for x in (by_channel, scale, offset))
+    if ambient:
+        record["ambient"] = pool.add(_grouped(btf.ambient_maps.float()).numpy())
+    record["last_cosine"] = math.cos(btf.lights.last)
+    return record
+
+
+def _bounds(btf: EigenBtf, weights: Float[Tensor, "view rank"]) -> Float[Tensor, "view group"]:
+    """Return the most each group of components can add to T, for the weights of a view."""
+    codes = btf.maps.flatten(0, 2)
+    low, high = codes.amin(0).float(), codes.amax(0).float()
+    ends = torch.stack([btf.offset + btf.scale * low, btf.offset + btf.scale * high]).abs()
+    each = weights.abs() * ends.amax((0, 2)).float()
+    padded = torch.zeros(len(each), -(-btf.rank // GROUP) * GROUP)
+    padded[:, : btf.rank] = each
+    return padded.reshape(len(each), -1, GROUP).sum(-1)
+
+
+def _grouped(x: Tensor) -> Tensor:
+    """Return (..., rank, 3) as (..., group, 16): four components of rgb and nothing in a vector."""
+    *batch, rank, _ = x.shape
+    groups = -(-rank // GROUP)
+    padded = torch.zeros(*batch, groups * GROUP, 4, dtype=x.dtype)
+    padded[..., :rank, :3] = x
+    return padded.reshape(*batch, groups, 16)
+
+
+def _mdf(pool: "_Pool", mdf: object) -> np.ndarray:
+    if not isinstance(mdf, Mdf) or mdf.delta.dtype != torch.uint8:
+        kind = f"{mdf.delta.dtype}" if isinstance(mdf, Mdf) else type(mdf).__name__
+        raise BackendError(f"opencl: expected an MDF of 8 bits, got {kind}; use the torch backend")
+    record = np.zeros(1, MDF)
+    delta = hemisphere.with_pole(mdf.delta, mdf.directions)
+    relief = mdf.relief
+    record["there"], record["height"], record["width"] = 1, *mdf.texels
+    record["rings"], record["ring_count"] = pool.add(_rings(mdf.directions)), _ring_count(mdf.directions)
+    record["delta"] = pool.add(delta.numpy())
+    missing = None if mdf.no_hit is None else hemisphere.with_pole(mdf.no_hit.float(), mdf.directions)
+    record["missing"] = -1 if missing is None else pool.add(missing.numpy())
+    record["relief_height"], record["relief_width"] = relief.drop.shape
+    codes = (relief.drop / relief.h * RELIEF_CODES).round().numpy().astype(np.uint16)
+    record["relief"] = pool.add(np.concatenate([codes, codes[:, :1]], 1))
+    record["hole"] = -1 if relief.hole is None else pool.add(relief.hole.float().numpy())
+    record["h"], record["delta_max"] = mdf.h, mdf.delta_max
+    return record
+
+
+def _rings(directions: DirectionSet) -> Float[np.ndarray, "ring 8"]:
+    """Return theta, size, phi0, first node, and whether all rings but the pole are alike."""
+    rings = hemisphere.rings(directions)
+    table = np.zeros((len(rings.theta), 8), np.float32)
+    table[:, :4] = torch.stack([x.float() for x in rings], -1).numpy()
+    outer = table[1:]
+    steps = np.arange(len(outer)) * outer[:1, 1]
+    table[:, 4] = bool((outer[:, 1:3] == outer[:1, 1:3]).all() and (outer[:, 3] == outer[:1, 3] + steps).all())
+    return table
+
+
+def _ring_count(directions: DirectionSet) -> int:
+    return len(hemisphere.rings(directions).theta)
+
+
+class _Pool:
+    """Arrays one behind the other, each on a block of its own."""
+
+    def __init__(self) -> None:
+        self._arrays: list[np.ndarray] = []
+        self._blocks = 0
+
+    def add(self, x: np.ndarray) -> int:
+        """Return the block `x` will begin on."""
+        first = self._blocks
+        self._arrays.append(x)
+        self._blocks += -(-x.nbytes // BLOCK)
+        return first
+
+    def joined(self) -> np.ndarray:
+        """Return all arrays as bytes."""
+        whole, at = np.zeros(max(self._blocks, 1) * BLOCK, np.uint8), 0
+        for x in self._arrays:
+            whole[at : at + x.nbytes] = np.ascontiguousarray(x).reshape(-1).view(np.uint8)
+            at += -(-x.nbytes // BLOCK) * BLOCK
+        self._arrays.clear()
+        return whole

@@ -1,0 +1,301 @@
+"""Frame after frame on OpenCL: nothing is made again that did not change.
+
+    set up the camera's triangles -> [set up and draw the lights' maps] -> fill, test and shade tiles
+
+Scene tables are uploaded once; a new light draws its shadow map again, a new camera only the picture. The torch
+frame (`frame.render`) is the formula of all of this.
+
+Kernels: kernels_cl/render/renderer.cl, kernels_cl/render/shadow_map.cl          Test: tests/render/test_renderer.py
+"""
+
+import time
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from jaxtyping import UInt8
+from torch import Tensor
+
+from torchmeso.backends import opencl
+from torchmeso.errors import BackendError, check_memory
+from torchmeso.geometry.camera import Camera
+from torchmeso.geometry.light import Light
+from torchmeso.render import device, shadow_map
+from torchmeso.render.film import Picture
+from torchmeso.render.frame import MEMORY_LIMIT, FrameOptions
+from torchmeso.render.rasterize import ROOM, STAMPS, TILE, DeviceViews
+from torchmeso.render.scene import Scene, assemble
+
+if TYPE_CHECKING:
+    import pyopencl as cl
+
+MAX_LIGHTS = 64
+"""Of a frame, as in kernels_cl/render/shadow_map.clh."""
+
+DETAILS, DISPLAY = 1, 2
+"""What a frame writes: a `Picture`, or bytes for a screen."""
+
+FRAME = np.dtype(
+    [(name, "i4") for name in ("lights", "ambient_paper", "depths", "outputs")]
+    + [(name, "i4") for name in ("capacity", "tiles_capacity", "stride", "pitch")]
+    + [("ambient", "f4"), ("background", "f4", 3), ("rank_error", "f4"), ("pad", "i4", 3)]
+)
+
+
+class Renderer:
+    """Renders one scene on the device; cameras and lights may change from frame to frame."""
+
+    def __init__(self, scene: Scene, options: FrameOptions | None = None):
+        """Upload `scene`.
+
+        Raises:
+            BackendError: there is no device, or a material is of a kind that kernels do not read.
+        """
+        start = time.perf_counter()
+        self.options = options or FrameOptions()
+        self._scene, self._world = scene, assemble(scene)
+        silhouettes = self.options.silhouette != "none"
+        self._device = device.upload(scene, self._world, silhouettes=silhouettes, ambient=scene.ambient > 0)
+        mode = {"none": 0, "paper": 1, "curved": 2}[self.options.silhouette] if self._device.textured else 0
+        self._defines = (f"-DSILHOUETTE={mode}",)
+        self._workers = opencl.units()
+        self._extra, self._cut_room = 4096, 0
+        self._lists: tuple[cl.Buffer, cl.Buffer] | None = None
+        self._picture: _Picture | None = None
+        self._maps: _Maps | None = None
+        self.counts: dict[str, int] = {}
+        self._seconds = {"upload": time.perf_counter() - start}
+
+    def render(self, camera: Camera, lights: tuple[Light, ...] | None = None) -> Picture:
+        """Return the picture seen by `camera`: linear colour, depth, object and shadows of each pixel.
+
+        Args:
+            camera: the view.
+            lights: in place of the scene's.
+
+        Returns:
+            the picture; the next call writes into the same memory, so clone what is to stay.
+
+        Raises:
+            SizeError: the picture would need more memory than the limit.
+            BackendError: too many lights.
+        """
+        start = time.perf_counter()
+        picture = self._frame(camera, lights, DETAILS)
+        seconds = {"frame": time.perf_counter() - start, **self._seconds}
+        self._seconds = {}
+        return picture.finished(camera, self.counts, seconds)
+
+    def show(self, camera: Camera, lights: tuple[Light, ...] | None = None) -> UInt8[Tensor, "height width 4"]:
+        """Return what a screen shows of the picture: sRGB of 8 bits, and 255 where an object is seen.
+
+        Arguments, memory and errors as for `render`.
+        """
+        picture = self._frame(camera, lights, DISPLAY)
+        return picture.shown[: camera.height, : camera.width]
+
+    def _frame(self, camera: Camera, lights: tuple[Light, ...] | None, outputs: int) -> "_Picture":
+        lights = self._scene.lights if lights is None else lights
+        if len(lights) > MAX_LIGHTS:
+            raise BackendError(
+                f"opencl: expected at most {MAX_LIGHTS} lights, got {len(lights)}; use the torch backend"
+            )
+        check_memory("render", camera.width * camera.height * 100.0, MEMORY_LIMIT, "render fewer pixels")
+        while True:
+            drawn = self._draw_maps(lights)
+            picture = self._draw_picture(camera, lights, outputs)
+            counts = picture.views.counts()
+            if self._fits(counts + (self._maps.views.counts() if drawn and self._maps else [])):
+                break
+        opencl.read(picture.results[:1] if outputs == DISPLAY else picture.results[1:])
+        self.counts = _named(counts[0], camera) | {
+            "shadow maps drawn": sum(self._maps.faces) if drawn and self._maps else 0
+        }
+        return picture
+
+    def milliseconds(self) -> dict[str, float]:
+        """Return the time of each kernel in the last frame; of the shadow maps' where they were last drawn."""
+        steps: dict[str, float] = {}
+        if self._maps is not None:
+            steps |= {f"light {name}": call.milliseconds for name, call in self._maps.views.steps.items()}
+            steps["light maps"] = sum(call.milliseconds for call in self._maps.draw)
+        if self._picture is not None:
+            steps |= {name: call.milliseconds for name, call in self._picture.views.steps.items()}
+            steps["picture"] = self._picture.draw.milliseconds
+        return steps
+
+    @property
+    def _taken(self) -> int:
+        return self._workers * STAMPS * ROOM
+
+    def _fits(self, counts: list[dict[str, int]]) -> bool:
+        """Return whether all layers and cut triangles had room; make more where not."""
+        used, slots = max(c["used"] for c in counts), max(c["slots"] for c in counts)
+        room = self._picture.views.room_for_cuts() if self._picture else 0
+        if used <= self._taken + self._extra and slots <= room:
+            return True
+        self._extra = max(self._extra, 2 * (used - self._taken))
+        self._cut_room = max(self._cut_room, slots)
+        self._lists = self._picture = self._maps = None
+        return False
+
+    def _layers(self) -> "tuple[cl.Buffer, cl.Buffer]":
+        """Return where the tiles at work keep their layers."""
+        if self._lists is None:
+            capacity = self._taken + self._extra
+            self._lists = opencl.allocate(64 * capacity), opencl.allocate(64 * capacity)
+        return self._lists
+
+    def _draw_maps(self, lights: tuple[Light, ...]) -> bool:
+        """Draw the lights' maps, unless they are the same as before."""
+        if not self.options.shadows or not lights:
+            self._maps = None
+            return False
+        if self._maps is not None and self._maps.lights is lights:
+            return False
+        faces = [shadow_map.cameras(self._world, light, self.options.shadow_map_size) for light in lights]
+        sizes = tuple((camera.width, camera.height) for views in faces for camera in views)
+        if self._maps is None or self._maps.sizes != sizes:
+            self._maps = self._make_maps(sizes)
+        maps = self._maps
+        maps.lights, maps.faces = lights, [len(views) for views in faces]
+        maps.views.aim([camera for views in faces for camera in views], taken=self._taken)
+        for call in maps.draw:
+            call()
+        return True
+
+    def _make_maps(self, sizes: tuple[tuple[int, int], ...]) -> "_Maps":
+        views = DeviceViews(self._device.mesh, len(sizes), cut_room=self._cut_room)
+        texels = opencl.allocate(8 * sum(w * h for w, h in sizes))
+        scene, capacity = self._device, np.int32(self._taken + self._extra)
+        draw = [
+            opencl.Call(
+                "render/shadow_map.cl", "draw_light", (self._workers,), (1,),
+                (views.views, views.triangles, views.slots, views.boxes, views.coarse, views.counters,
+                 scene.mesh.faces, scene.records, scene.facets, scene.tables, scene.mdfs, np.int32(number),
+                 np.int32(views.stride), capacity, *self._layers(), texels),
+                self._defines,
+            )
+            for number in range(len(sizes))
+        ]  # fmt: skip
+        return _Maps(views=views, texels=texels, draw=draw, sizes=sizes)
+
+    def _draw_picture(self, camera: Camera, lights: tuple[Light, ...], outputs: int) -> "_Picture":
+        key = (camera.width, camera.height, len(lights), self._maps.sizes if self._maps else None)
+        if self._picture is None or self._picture.key != key:
+            self._picture = self._make_picture(key)
+        picture, scene, maps = self._picture, self._scene, self._maps
+        records = device.light_records(lights)
+        if maps is not None:
+            records["faces"] = maps.faces
+            records["first_face"] = np.cumsum([0, *maps.faces[:-1]])
+        frame = np.zeros(1, FRAME)
+        frame["lights"], frame["ambient_paper"] = len(lights), scene.ambient_rule == "paper"
+        frame["depths"], frame["outputs"] = outputs == DETAILS or maps is not None, outputs
+        frame["capacity"], frame["stride"] = self._taken + self._extra, picture.views.stride
+        frame["pitch"] = picture.rgba.shape[1]
+        frame["ambient"], frame["background"] = scene.ambient, scene.background
+        opencl.write(picture.lights, records)
+        opencl.write(picture.frame, frame)
+        if outputs != picture.outputs:
+            opencl.write(picture.empty, np.zeros(picture.tiles, np.int32))
+            picture.outputs = outputs
+        picture.views.aim([camera], taken=self._taken)
+        picture.draw()
+        return picture
+
+    def _make_picture(self, key: tuple) -> "_Picture":
+        width, height, n_light, _ = key
+        rows, pitch = -(-height // 4) * 4, -(-width // 4) * 4
+        tiles = -(-width // TILE) * -(-height // TILE)
+        rgba, depth = torch.zeros(rows, pitch, 4), torch.zeros(rows, pitch)
+        owner = torch.zeros(rows, pitch, dtype=torch.int32)
+        shadowed = torch.zeros(max(n_light, 1), rows, pitch, dtype=torch.uint8)
+        shown = torch.zeros(rows, pitch, 4, dtype=torch.uint8)
+        results = [(opencl.buffer(x), x) for x in (shown, rgba, depth, owner, shadowed)]
+        views = DeviceViews(self._device.mesh, 1, cut_room=self._cut_room)
+        lights = opencl.upload(device.light_records(()).repeat(max(n_light, 1)))
+        frame, empty = opencl.upload(np.zeros(1, FRAME)), opencl.upload(np.zeros(tiles, np.int32))
+        scene, light = self._device, self._maps
+        shadows = (
+            (light.views.views, light.views.slots, light.views.triangles, light.texels)
+            if light
+            else (views.views, views.slots, views.triangles, views.slots)
+        )
+        draw = opencl.Call(
+            "render/renderer.cl", "draw", (self._workers,), (1,),
+            (views.views, views.triangles, views.slots, views.boxes, views.coarse, views.counters,
+             scene.mesh.faces, scene.records, scene.facets, scene.tables, scene.mdfs, scene.reflectances, lights,
+             *shadows, frame, *self._layers(), *(b for b, _ in results), empty),
+            self._defines,
+        )  # fmt: skip
+        return _Picture(
+            key=key, views=views, results=results, lights=lights, frame=frame, empty=empty, tiles=tiles, draw=draw,
+            shown=shown, rgba=rgba, depth=depth, owner=owner, shadowed=shadowed,
+        )  # fmt: skip
+
+
+@dataclass(eq=False, kw_only=True)
+class _Maps:
+    """Shadow maps of all lights on the device."""
+
+    views: DeviceViews
+    texels: "cl.Buffer"
+    draw: list[opencl.Call]
+    sizes: tuple[tuple[int, int], ...]
+    lights: tuple[Light, ...] = ()
+    faces: list[int] = field(default_factory=list)
+
+
+@dataclass(eq=False, kw_only=True)
+class _Picture:
+    """What a frame of one size writes into."""
+
+    key: tuple
+    views: DeviceViews
+    results: "list[tuple[cl.Buffer, Tensor]]"
+    lights: "cl.Buffer"
+    frame: "cl.Buffer"
+    empty: "cl.Buffer"
+    tiles: int
+    draw: opencl.Call
+    shown: Tensor
+    rgba: Tensor
+    depth: Tensor
+    owner: Tensor
+    shadowed: Tensor
+    outputs: int = 0
+
+    def finished(self, camera: Camera, counts: dict[str, int], seconds: dict[str, float]) -> Picture:
+        """Return the frame just drawn."""
+        height, width = camera.height, camera.width
+        return Picture(
+            rgb=self.rgba[:height, :width, :3],
+            depth=self.depth[:height, :width],
+            owner=self.owner[:height, :width].long(),
+            shadowed=self.shadowed[: self.key[2], :height, :width].bool(),
+            counts=counts,
+            seconds=seconds,
+        )
+
+
+def _named(counts: dict[str, int], camera: Camera) -> dict[str, int]:
+    """Return the counters under the names of `Picture.counts`."""
+    return {
+        "triangles drawn": counts["drawn"],
+        "fragments": counts["fragments"],
+        "layers": counts["deepest"],
+        "pixels with a fragment": counts["covered"],
+        "pixels": camera.width * camera.height,
+        "intervals": counts["intervals"],
+        "intervals passed by their length": counts["deep"],
+        "intervals carved": counts["carved"],
+        "pixels inside an object": counts["inside"],
+        "depth look-ups": counts["looked"],
+        "stretches behind a resolved pixel": counts["hidden"],
+        "triangles without a pixel": counts["degenerate"],
+        "triangles behind the eye": counts["behind"],
+        "tiles that stayed empty": counts["empty_tiles"],
+        "groups of components spared": counts["spared"],
+    }
