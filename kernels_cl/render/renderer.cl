@@ -388,7 +388,8 @@ void draw(__global const View *restrict view, __global const Triangle *restrict 
             __global const float16 *key_of = key + lists.begin[s];
             tally.covered += __builtin_popcount(lanes & to_bits(key_of[0] < INFINITY));
             tally.deepest = MAX(tally.deepest, filled);
-            for (int k = 0; k < filled; k++) tally.fragments += __builtin_popcount(to_bits(key_of[k] < INFINITY));
+            for (int k = 0; k < filled; k++)
+                tally.fragments += __builtin_popcount(lanes & to_bits(key_of[k] < INFINITY));
             const Seen seen = look(&place, &rays, key_of, slot + lists.begin[s], filled, lanes, frame->depths, &tally);
             draw_stamp(&place, frame, reflectances, lights, &shadows, &rays, lanes, &seen, shown, rgba, depth, owner,
                        shadowed, &spared);

@@ -32,6 +32,8 @@ os.environ.setdefault("POCL_AFFINITY", "1")
 
 KERNELS = files("kernels_cl")
 
+_pending: "list[cl.Event]" = []
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DeviceInfo:
@@ -193,13 +195,15 @@ def allocate(size: int) -> "cl.Buffer":
 
 
 def write(device: "cl.Buffer", x: np.ndarray) -> None:
-    """Copy `x` into a buffer, in the order of the queue; `x` may be changed at once."""
-    _pyopencl().enqueue_copy(queue(), device, np.ascontiguousarray(x), is_blocking=True)
+    """Copy `x` into a buffer, in the order of the queue; `x` must stay as it is until the queue is waited for."""
+    # An event that is thrown away waits for its command first: keep it until the queue is waited for anyway.
+    _pending.append(_pyopencl().enqueue_copy(queue(), device, x, is_blocking=False))
 
 
 def fetch(device: "cl.Buffer", x: np.ndarray) -> np.ndarray:
     """Wait for the queue, copy a buffer into `x` and return it."""
     _pyopencl().enqueue_copy(queue(), x, device, is_blocking=True)
+    _pending.clear()
     return x
 
 
@@ -211,6 +215,7 @@ def units() -> int:
 def finish() -> None:
     """Wait for the queue."""
     queue().finish()
+    _pending.clear()
 
 
 def buffer(x: Tensor) -> "cl.Buffer":
@@ -252,6 +257,7 @@ def self_test() -> float:
     return (y - (2 * x + 1)).abs().max().item()
 
 
+@cache
 def _pyopencl() -> ModuleType:
     """Import pyopencl, or say how to get it."""
     try:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchmeso.backends import opencl
@@ -212,10 +212,11 @@ def _mdf(pool: "_Pool", mdf: object) -> np.ndarray:
         raise BackendError(f"opencl: expected an MDF of 8 bits, got {kind}; use the torch backend")
     record = np.zeros(1, MDF)
     delta = hemisphere.with_pole(mdf.delta, mdf.directions)
+    paired = torch.stack([delta, delta[_next_in_ring(mdf.directions)]], -1)
     relief = mdf.relief
     record["there"], record["height"], record["width"] = 1, *mdf.texels
     record["rings"], record["ring_count"] = pool.add(_rings(mdf.directions)), _ring_count(mdf.directions)
-    record["delta"] = pool.add(delta.numpy())
+    record["delta"] = pool.add(paired.numpy())
     missing = None if mdf.no_hit is None else hemisphere.with_pole(mdf.no_hit.float(), mdf.directions)
     record["missing"] = -1 if missing is None else pool.add(missing.numpy())
     record["relief_height"], record["relief_width"] = relief.drop.shape
@@ -235,6 +236,15 @@ def _rings(directions: DirectionSet) -> Float[np.ndarray, "ring 8"]:
     steps = np.arange(len(outer)) * outer[:1, 1]
     table[:, 4] = bool((outer[:, 1:3] == outer[:1, 1:3]).all() and (outer[:, 3] == outer[:1, 3] + steps).all())
     return table
+
+
+def _next_in_ring(directions: DirectionSet) -> Int[Tensor, "node"]:
+    """Return, for each node, the next one of its ring."""
+    rings = hemisphere.rings(directions)
+    following = torch.zeros(directions.n_nodes, dtype=torch.long)
+    for size, offset in zip(rings.size.tolist(), rings.offset.tolist(), strict=True):
+        following[offset : offset + size] = offset + (torch.arange(size) + 1) % size
+    return following
 
 
 def _ring_count(directions: DirectionSet) -> int:

@@ -36,7 +36,7 @@ GUARD_BAND = 16384.0
 """Pixels around the origin beyond which triangles are cut; keeps the integers of the edge functions below 2^52."""
 
 
-TILE, STAMPS, ROOM = 64, 256, 8
+TILE, STAMPS, ROOM = 64, 256, 4
 """Side of a tile in pixels, its stamps, and the layers a stamp begins with, in kernels_cl/render/rasterize.clh."""
 
 TRIANGLE_BYTES, SLOT_BYTES, PROJECTED_BYTES, LIMIT = 96, 64, 24, 1 << 30
@@ -297,6 +297,7 @@ class DeviceMesh(NamedTuple):
         vertices: (V, 3) float64.
         faces: (F, 3) int32.
         tags: (F, 2) int32: component << 2 | 2 where it is closed; object.
+        corners: (8, 3) float64 of the box around all vertices.
         n_vertex: V.
         n_face: F.
     """
@@ -304,6 +305,7 @@ class DeviceMesh(NamedTuple):
     vertices: "cl.Buffer"
     faces: "cl.Buffer"
     tags: "cl.Buffer"
+    corners: Float[np.ndarray, "8 3"]
     n_vertex: int
     n_face: int
 
@@ -331,10 +333,21 @@ def upload_mesh(
         BackendError: there is no OpenCL device.
     """
     tags = torch.zeros(len(faces), 2, dtype=torch.int32) if tags is None else tags
+    box = torch.stack([vertices.amin(0), vertices.amax(0)]).double() if len(vertices) else torch.zeros(2, 3).double()
+    corners = torch.stack(torch.meshgrid(*box.unbind(1), indexing="ij"), -1).reshape(8, 3)
     return DeviceMesh(
         opencl.upload(vertices.double().numpy()), opencl.upload(faces.int().numpy()),
-        opencl.upload(tags.int().numpy()), len(vertices), len(faces),
+        opencl.upload(tags.int().numpy()), corners.numpy(), len(vertices), len(faces),
     )  # fmt: skip
+
+
+def _whole(camera: Camera, corners: Float[np.ndarray, "n 3"]) -> bool:
+    """Return whether nothing between `corners` can cross the near plane or the guard band; in numpy, for its speed."""
+    x, y, back = camera.axes.double().numpy() @ (corners - camera.eye.double().numpy()).T
+    w = -back if camera.projection == "perspective" else np.ones_like(back)
+    reach = GUARD_BAND - max(camera.width, camera.height)
+    inside = (np.abs(x) < reach * camera.pixel_size * w) & (np.abs(y) < reach * camera.pixel_size * w)
+    return bool(((-back > camera.near) & inside).all())
 
 
 class DeviceViews:
@@ -349,7 +362,7 @@ class DeviceViews:
             cut_room: triangles that faces may become which cross the near plane or the guard band.
             cull: whether faces of closed components that are turned away are left out.
         """
-        self.mesh, self.count = mesh, count
+        self.mesh, self.count, self.may_cut, self._was_cut = mesh, count, True, True
         self.padded = -(-max(mesh.n_face, 1) // 16) * 16
         self.stride = self.padded + -(-max(cut_room, 1024) // 16) * 16
         vectors = -(-(self.stride // 16) // 16) * 16
@@ -396,11 +409,16 @@ class DeviceViews:
             r["texels"] = texels
             texels += camera.width * camera.height
         counters = np.zeros((self.count, 32), np.int32)
-        counters[:, 0] = taken
+        counters[:, COUNTERS.index("used")] = taken
+        counters[:, COUNTERS.index("vectors")] = self.padded // 16
         opencl.write(self.views, self._records)
         opencl.write(self.counters, counters)
-        for step in self.steps.values():
-            step()
+        self.steps["vertices"]()
+        self.steps["triangles"]()
+        self.may_cut = not all(_whole(camera, self.mesh.corners) for camera in cameras)
+        if self.may_cut or self._was_cut:
+            self.steps["cut triangles"]()
+        self._was_cut = self.may_cut
 
     def counts(self) -> list[dict[str, int]]:
         """Wait, and return what each view did."""
@@ -461,7 +479,7 @@ class DeviceRaster:
         key, slot = key[begin[stamp] + layer], slot[begin[stamp] + layer]
         lane = np.arange(16)
         x, y = 4 * (stamp % across)[:, None] + lane % 4, 4 * (stamp // across)[:, None] + lane // 4
-        there = np.isfinite(key)
+        there = np.isfinite(key) & (x < width) & (y < height)
         pixel = (y * width + x)[there]
         order = np.argsort(pixel, kind="stable")
         pixel, face = torch.from_numpy(pixel[order]), torch.from_numpy(faces[slot[there][order]]).long()
