@@ -203,15 +203,12 @@ __kernel void cut_faces(__global const View *restrict views, __global const doub
 #pragma OPENCL FP_CONTRACT ON
 
 // All fragments of a picture. Each work-item takes tile after tile until none is left.
-__kernel __attribute__((reqd_work_group_size(1, 1, 1)))
-void fill_tiles(__global const View *restrict view, __global const Triangle *restrict triangles,
-                __global const int16 *restrict boxes, __global const int16 *restrict coarse,
-                __global Counters *restrict counters, const int stride,
-                const int capacity,
-                __global int *restrict begin,       // (stamps) first layer of each stamp
-                __global int *restrict layers,      // (stamps)
-                __global float16 *restrict key,     // (capacity) grows with depth, inf = no fragment
-                __global int16 *restrict slot)      // (capacity)
+static INNER void fill_all_tiles(const int worker, __global const View *restrict view,
+                                 __global const Triangle *restrict triangles, __global const int16 *restrict boxes,
+                                 __global const int16 *restrict coarse, __global Counters *restrict counters,
+                                 const int stride, const int capacity, __global int *restrict begin,
+                                 __global int *restrict layers, __global float16 *restrict key,
+                                 __global int16 *restrict slot)
 {
     const int across = (view->width + TILE - 1) / TILE, down = (view->height + TILE - 1) / TILE;
     const int stamps_across = (view->width + 3) >> 2;
@@ -230,4 +227,18 @@ void fill_tiles(__global const View *restrict view, __global const Triangle *res
             layers[(y >> 2) * stamps_across + (x >> 2)] = lists.filled[s];
         }
     }
+}
+
+__kernel __attribute__((reqd_work_group_size(1, 1, 1)))
+void fill_tiles(__global const View *restrict view, __global const Triangle *restrict triangles,
+                __global const int16 *restrict boxes, __global const int16 *restrict coarse,
+                __global Counters *restrict counters, const int stride,
+                const int capacity,
+                __global int *restrict begin,       // (stamps) first layer of each stamp
+                __global int *restrict layers,      // (stamps)
+                __global float16 *restrict key,     // (capacity) grows with depth, inf = no fragment
+                __global int16 *restrict slot)      // (capacity)
+{
+    fill_all_tiles(get_group_id(0), view, triangles, boxes, coarse, counters, stride, capacity, begin, layers, key,
+                   slot);
 }

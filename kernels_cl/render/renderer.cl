@@ -106,6 +106,7 @@ static void shade_object(const Place *place, __global const Reflectance *reflect
         float16 horizon = wi.z / reflectance->last_cosine;
         horizon = horizon > 1.0f ? 1.0f : horizon;
         const Floats arriving = {falloff * horizon * (1.0f / PI)};
+        fetch_ahead(tables, reflectance, &look_up, light_node, arrives);
         for (int b = arrives; b; b &= b - 1) {
             const int l = __builtin_ctz(b);
             const float4 T = reflect(tables, reflectance, frame->rank_error, &look_up, light_node, light_share, l, spared);
@@ -332,24 +333,20 @@ static void clear_stamp(__global const Frame *frame, const int plane, const int 
     }
 }
 
-__kernel __attribute__((reqd_work_group_size(1, 1, 1)))
-void draw(__global const View *restrict view, __global const Triangle *restrict triangles,
-          __global const Slot *restrict slots,
-          __global const int16 *restrict boxes, __global const int16 *restrict coarse,
-          __global Counters *restrict counters, __global const int *restrict faces,
-          __global const float16 *restrict records, __global const Facet *restrict facets,
-          __global const uchar *restrict tables, __global const Mdf *restrict mdfs,
-          __global const Reflectance *restrict reflectances, __global const Light *restrict lights,
-          __global const View *restrict light_views, __global const Slot *restrict light_slots,
-          __global const Triangle *restrict light_triangles, __global const Texel *restrict texels,
-          __global const Frame *restrict frame,
-          __global float16 *restrict key, __global int16 *restrict slot,  // layers of the tiles at work
-          __global uchar4 *restrict shown,     // (H, pitch) sRGB, and 255 where an object is seen
-          __global float4 *restrict rgba,      // (H, pitch) linear colour, and whether an object is seen
-          __global float *restrict depth,      // (H, pitch)
-          __global int *restrict owner,        // (H, pitch)
-          __global uchar *restrict shadowed,   // (light, H, pitch)
-          __global int *restrict empty)        // (tiles) whether a tile already shows the background
+static INNER void draw_tiles(const int worker, __global const View *restrict view,
+                             __global const Triangle *restrict triangles, __global const Slot *restrict slots,
+                             __global const int16 *restrict boxes, __global const int16 *restrict coarse,
+                             __global Counters *restrict counters, __global const int *restrict faces,
+                             __global const float16 *restrict records, __global const Facet *restrict facets,
+                             __global const uchar *restrict tables, __global const Mdf *restrict mdfs,
+                             __global const Reflectance *restrict reflectances, __global const Light *restrict lights,
+                             __global const View *restrict light_views, __global const Slot *restrict light_slots,
+                             __global const Triangle *restrict light_triangles, __global const Texel *restrict texels,
+                             __global const Frame *restrict frame, __global float16 *restrict key,
+                             __global int16 *restrict slot, __global uchar4 *restrict shown,
+                             __global float4 *restrict rgba, __global float *restrict depth,
+                             __global int *restrict owner, __global uchar *restrict shadowed,
+                             __global int *restrict empty)
 {
     const Place place = {view, slots, faces, records, facets, tables, mdfs, counters->behind_near};
     const Shadows shadows = {light_views, light_slots, light_triangles, texels};
@@ -364,7 +361,7 @@ void draw(__global const View *restrict view, __global const Triangle *restrict 
         const int tile = atomic_inc(&counters->tile);
         if (tile >= across * down) break;
         const int x0 = tile % across * TILE, y0 = tile / across * TILE;
-        const int room = get_group_id(0) * ROOM * STAMPS * STAMPS;
+        const int room = worker * ROOM * STAMPS * STAMPS;
         if (!fill_tile(view, triangles, boxes, coarse, counters->vectors, frame->stride >> 4, x0, y0, room, &lists, key,
                        slot, &counters->used, frame->capacity))
             continue;  // the host gives more room and asks again
@@ -398,4 +395,28 @@ void draw(__global const View *restrict view, __global const Triangle *restrict 
     count_up(counters, &tally);
     atomic_add(&counters->spared, spared);
     atomic_add(&counters->empty_tiles, skipped);
+}
+
+__kernel __attribute__((reqd_work_group_size(1, 1, 1)))
+void draw(__global const View *restrict view, __global const Triangle *restrict triangles,
+          __global const Slot *restrict slots,
+          __global const int16 *restrict boxes, __global const int16 *restrict coarse,
+          __global Counters *restrict counters, __global const int *restrict faces,
+          __global const float16 *restrict records, __global const Facet *restrict facets,
+          __global const uchar *restrict tables, __global const Mdf *restrict mdfs,
+          __global const Reflectance *restrict reflectances, __global const Light *restrict lights,
+          __global const View *restrict light_views, __global const Slot *restrict light_slots,
+          __global const Triangle *restrict light_triangles, __global const Texel *restrict texels,
+          __global const Frame *restrict frame,
+          __global float16 *restrict key, __global int16 *restrict slot,  // layers of the tiles at work
+          __global uchar4 *restrict shown,     // (H, pitch) sRGB, and 255 where an object is seen
+          __global float4 *restrict rgba,      // (H, pitch) linear colour, and whether an object is seen
+          __global float *restrict depth,      // (H, pitch)
+          __global int *restrict owner,        // (H, pitch)
+          __global uchar *restrict shadowed,   // (light, H, pitch)
+          __global int *restrict empty)        // (tiles) whether a tile already shows the background
+{
+    draw_tiles(get_group_id(0), view, triangles, slots, boxes, coarse, counters, faces, records, facets, tables, mdfs,
+               reflectances, lights, light_views, light_slots, light_triangles, texels, frame, key, slot, shown, rgba,
+               depth, owner, shadowed, empty);
 }

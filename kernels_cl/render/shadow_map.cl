@@ -73,16 +73,15 @@ static void block_stamp(const Place *place, const Rays *rays, __global const flo
     }
 }
 
-__kernel __attribute__((reqd_work_group_size(1, 1, 1)))
-void draw_light(__global const View *restrict views, __global const Triangle *restrict triangles,
-                __global const Slot *restrict slots,
-                __global const int16 *restrict boxes, __global const int16 *restrict coarse,
-                __global Counters *restrict counters, __global const int *restrict faces,
-                __global const float16 *restrict records, __global const Facet *restrict facets,
-                __global const uchar *restrict tables, __global const Mdf *restrict mdfs, const int number,
-                const int stride, const int capacity,
-                __global float16 *restrict key, __global int16 *restrict slot,  // layers of the tiles at work
-                __global Texel *restrict texels)
+static INNER void draw_light_tiles(const int worker, __global const View *restrict views,
+                                   __global const Triangle *restrict triangles, __global const Slot *restrict slots,
+                                   __global const int16 *restrict boxes, __global const int16 *restrict coarse,
+                                   __global Counters *restrict counters, __global const int *restrict faces,
+                                   __global const float16 *restrict records, __global const Facet *restrict facets,
+                                   __global const uchar *restrict tables, __global const Mdf *restrict mdfs,
+                                   const int number, const int stride, const int capacity,
+                                   __global float16 *restrict key, __global int16 *restrict slot,
+                                   __global Texel *restrict texels)
 {
     __global const View *view = views + number;
     __global Counters *counted = counters + number;
@@ -96,7 +95,7 @@ void draw_light(__global const View *restrict views, __global const Triangle *re
         const int tile = atomic_inc(&counted->tile);
         if (tile >= across * down) break;
         const int x0 = tile % across * TILE, y0 = tile / across * TILE;
-        const int room = get_group_id(0) * ROOM * STAMPS * STAMPS;
+        const int room = worker * ROOM * STAMPS * STAMPS;
         if (!fill_tile(view, triangles + view->slots, boxes + 4 * (view->slots >> 4), coarse + number * 4 * coarse_stride,
                        counted->vectors, stride >> 4, x0, y0, room, &lists, key, slot, &counted->used, capacity))
             continue;  // the host gives more room and asks again
@@ -121,4 +120,19 @@ void draw_light(__global const View *restrict views, __global const Triangle *re
         }
     }
     count_up(counted, &tally);
+}
+
+__kernel __attribute__((reqd_work_group_size(1, 1, 1)))
+void draw_light(__global const View *restrict views, __global const Triangle *restrict triangles,
+                __global const Slot *restrict slots,
+                __global const int16 *restrict boxes, __global const int16 *restrict coarse,
+                __global Counters *restrict counters, __global const int *restrict faces,
+                __global const float16 *restrict records, __global const Facet *restrict facets,
+                __global const uchar *restrict tables, __global const Mdf *restrict mdfs, const int number,
+                const int stride, const int capacity,
+                __global float16 *restrict key, __global int16 *restrict slot,  // layers of the tiles at work
+                __global Texel *restrict texels)
+{
+    draw_light_tiles(get_group_id(0), views, triangles, slots, boxes, coarse, counters, faces, records, facets,
+                     tables, mdfs, number, stride, capacity, key, slot, texels);
 }

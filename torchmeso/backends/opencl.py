@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from importlib.resources import files
+from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Literal
 
@@ -32,7 +33,15 @@ os.environ.setdefault("POCL_AFFINITY", "1")
 
 KERNELS = files("kernels_cl")
 
-_pending: "list[cl.Event]" = []
+WIDE = (
+    "#pragma clang attribute push(__attribute__((min_vector_width(512))), apply_to = function)\n"
+    '#pragma clang attribute push(__attribute__((target("avx512f,avx512bw,avx512cd,avx512dq,avx512vl"))), '
+    "apply_to = function)\n",
+    "#pragma clang attribute pop\n#pragma clang attribute pop\n",
+)
+"""What is put around a kernel's source where the processor has AVX-512. PoCL builds for what its compiler knows of the
+processor, which for one younger than the compiler is AVX2; vectors of sixteen are then split in two."""
+
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -163,13 +172,25 @@ def compose(path: str) -> str:
 @cache
 def _program(path: str, options: tuple[str, ...]) -> "cl.Program":
     cl = _pyopencl()
-    program = cl.Program(queue().context, compose(path))
+    source = WIDE[0] + compose(path) + WIDE[1] if _has_avx512() else compose(path)
+    program = cl.Program(queue().context, source)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", cl.CompilerWarning)  # the compiler's remarks are ours, not the user's
             return program.build(["-cl-std=CL1.2", *options])
     except cl.Error as error:
         raise BackendError(f"kernels_cl/{path} did not build:\n{error}") from error
+
+
+@cache
+def _has_avx512() -> bool:
+    """Return whether the chosen device is this processor and it has AVX-512."""
+    try:
+        flags = re.search(r"^flags\s*:(.*)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
+    except OSError:
+        return False
+    wanted = {f"avx512{x}" for x in ("f", "bw", "cd", "dq", "vl")}
+    return _shares_memory() and flags is not None and wanted <= set(flags[1].split())
 
 
 def upload(x: np.ndarray) -> "cl.Buffer":
@@ -194,28 +215,58 @@ def allocate(size: int) -> "cl.Buffer":
         raise BackendError(f"opencl: no room for a buffer of {human_size(size)} ({error})") from error
 
 
-def write(device: "cl.Buffer", x: np.ndarray) -> None:
-    """Copy `x` into a buffer, in the order of the queue; `x` must stay as it is until the queue is waited for."""
-    # An event that is thrown away waits for its command first: keep it until the queue is waited for anyway.
-    _pending.append(_pyopencl().enqueue_copy(queue(), device, x, is_blocking=False))
+class Shared:
+    """An array that host and device both read and write, a few values per frame.
+
+    Attributes:
+        array: the host's side; change it only while no kernel runs.
+        buffer: the device's.
+    """
+
+    def __init__(self, x: np.ndarray):
+        """Take memory for `x`, on a border of 64 bytes, and copy it there."""
+        cl = _pyopencl()
+        room = np.zeros(max(x.nbytes, 64) + 64, np.uint8)
+        first = -room.ctypes.data % 64
+        self.array = room[first : first + x.nbytes].view(x.dtype).reshape(x.shape)
+        self.array[...] = x
+        flags = cl.mem_flags.READ_WRITE | cl.mem_flags.USE_HOST_PTR
+        self.buffer = cl.Buffer(queue().context, flags, hostbuf=room[first : first + max(x.nbytes, 64)])
+
+    def send(self) -> None:
+        """Make what the host wrote visible to kernels that are put into the queue from now on."""
+        _exchange(self.buffer, self.array, _pyopencl().map_flags.WRITE)
+
+    def receive(self) -> np.ndarray:
+        """Wait for the queue and return what kernels wrote."""
+        _exchange(self.buffer, self.array, _pyopencl().map_flags.READ)
+        queue().finish()
+        return self.array
+
+
+def _exchange(device: "cl.Buffer", x: np.ndarray, way: int) -> None:
+    """Map and unmap a buffer over the host's memory; a device that works in that memory need not be told."""
+    if _shares_memory():
+        return
+    mapped, _ = _pyopencl().enqueue_map_buffer(queue(), device, way, 0, x.shape, x.dtype)
+    mapped.base.release(queue())
+
+
+@cache
+def _shares_memory() -> bool:
+    """Return whether the device is PoCL on this processor, which uses the host's memory as it is."""
+    return "pocl" in queue().device.platform.version.lower() and bool(queue().device.host_unified_memory)
 
 
 def fetch(device: "cl.Buffer", x: np.ndarray) -> np.ndarray:
     """Wait for the queue, copy a buffer into `x` and return it."""
     _pyopencl().enqueue_copy(queue(), x, device, is_blocking=True)
-    _pending.clear()
     return x
 
 
 def units() -> int:
     """Return how many work-items run at once: for kernels whose work-items fetch their own work."""
     return queue().device.max_compute_units
-
-
-def finish() -> None:
-    """Wait for the queue."""
-    queue().finish()
-    _pending.clear()
 
 
 def buffer(x: Tensor) -> "cl.Buffer":
@@ -235,11 +286,8 @@ def buffer(x: Tensor) -> "cl.Buffer":
 
 def read(pairs: "Sequence[tuple[cl.Buffer, Tensor]]") -> None:
     """Wait for the queue and make what kernels wrote into `buffer`s visible in the tensors they lie over."""
-    cl = _pyopencl()
     for device, x in pairs:
-        dtype = x.numpy().dtype
-        mapped, _ = cl.enqueue_map_buffer(queue(), device, cl.map_flags.READ, 0, tuple(x.shape), dtype)
-        mapped.base.release(queue())
+        _exchange(device, x.numpy(), _pyopencl().map_flags.READ)
     queue().finish()
 
 

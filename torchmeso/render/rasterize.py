@@ -366,14 +366,14 @@ class DeviceViews:
         self.padded = -(-max(mesh.n_face, 1) // 16) * 16
         self.stride = self.padded + -(-max(cut_room, 1024) // 16) * 16
         vectors = -(-(self.stride // 16) // 16) * 16
-        self._records = np.zeros(count, VIEW)
-        self.views = opencl.upload(self._records)
+        self._views = opencl.Shared(np.zeros(count, VIEW))
+        self._counters = opencl.Shared(np.zeros((count, 32), np.int32))
+        self.views, self.counters = self._views.buffer, self._counters.buffer
         self.projected = opencl.allocate(count * mesh.n_vertex * PROJECTED_BYTES)
         self.triangles = opencl.allocate(count * self.stride * TRIANGLE_BYTES)
         self.slots = opencl.allocate(count * self.stride * SLOT_BYTES)
         self.boxes = opencl.upload(np.full(count * self.stride * 4, LIMIT, np.int32))
         self.coarse = opencl.upload(np.full(count * vectors * 4, LIMIT, np.int32))
-        self.counters = opencl.upload(np.zeros((count, 32), np.int32))
         crossing = opencl.allocate(count * self.padded)
         sizes = (np.int32(mesh.n_face), np.int32(self.padded), np.int32(self.stride), np.int32(cull))
         screen = (self.triangles, self.slots, self.boxes, self.coarse, crossing, self.counters)
@@ -400,7 +400,7 @@ class DeviceViews:
             taken: layers that the tiles begin with.
         """
         texels = 0
-        for i, (r, camera) in enumerate(zip(self._records, cameras, strict=True)):
+        for i, (r, camera) in enumerate(zip(self._views.array, cameras, strict=True)):
             r["eye"], r["axes"] = camera.eye.double().numpy(), camera.axes.double().numpy()
             r["pixel_size"], r["near"] = camera.pixel_size, camera.near
             r["width"], r["height"] = camera.width, camera.height
@@ -408,11 +408,12 @@ class DeviceViews:
             r["vertices"], r["slots"] = i * self.mesh.n_vertex, i * self.stride
             r["texels"] = texels
             texels += camera.width * camera.height
-        counters = np.zeros((self.count, 32), np.int32)
+        counters = self._counters.array
+        counters[:] = 0
         counters[:, COUNTERS.index("used")] = taken
         counters[:, COUNTERS.index("vectors")] = self.padded // 16
-        opencl.write(self.views, self._records)
-        opencl.write(self.counters, counters)
+        self._views.send()
+        self._counters.send()
         self.steps["vertices"]()
         self.steps["triangles"]()
         self.may_cut = not all(_whole(camera, self.mesh.corners) for camera in cameras)
@@ -422,8 +423,7 @@ class DeviceViews:
 
     def counts(self) -> list[dict[str, int]]:
         """Wait, and return what each view did."""
-        found = opencl.fetch(self.counters, np.zeros((self.count, 32), np.int32))
-        return [dict(zip(COUNTERS, row.tolist(), strict=False)) for row in found]
+        return [dict(zip(COUNTERS, row, strict=False)) for row in self._counters.receive().tolist()]
 
     def room_for_cuts(self) -> int:
         """Return triangles that cut faces may become."""

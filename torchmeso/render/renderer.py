@@ -186,20 +186,24 @@ class Renderer:
         if self._picture is None or self._picture.key != key:
             self._picture = self._make_picture(key)
         picture, scene, maps = self._picture, self._scene, self._maps
-        records = device.light_records(lights)
+        if lights is not picture.drawn_lights:
+            picture.lights.array[: max(len(lights), 1)] = device.light_records(lights)
+            picture.drawn_lights = lights
+        records = picture.lights.array
         if maps is not None:
             records["faces"] = maps.faces
             records["first_face"] = np.cumsum([0, *maps.faces[:-1]])
-        frame = np.zeros(1, FRAME)
+        frame = picture.frame.array
         frame["lights"], frame["ambient_paper"] = len(lights), scene.ambient_rule == "paper"
         frame["depths"], frame["outputs"] = outputs == DETAILS or maps is not None, outputs
         frame["capacity"], frame["stride"] = self._taken + self._extra, picture.views.stride
         frame["pitch"] = picture.rgba.shape[1]
         frame["ambient"], frame["background"] = scene.ambient, scene.background
-        opencl.write(picture.lights, records)
-        opencl.write(picture.frame, frame)
+        picture.lights.send()
+        picture.frame.send()
         if outputs != picture.outputs:
-            opencl.write(picture.empty, np.zeros(picture.tiles, np.int32))
+            picture.empty.array[:] = 0
+            picture.empty.send()
             picture.outputs = outputs
         picture.views.aim([camera], taken=self._taken)
         picture.draw()
@@ -215,8 +219,8 @@ class Renderer:
         shown = torch.zeros(rows, pitch, 4, dtype=torch.uint8)
         results = [(opencl.buffer(x), x) for x in (shown, rgba, depth, owner, shadowed)]
         views = DeviceViews(self._device.mesh, 1, cut_room=self._cut_room)
-        lights = opencl.upload(device.light_records(()).repeat(max(n_light, 1)))
-        frame, empty = opencl.upload(np.zeros(1, FRAME)), opencl.upload(np.zeros(tiles, np.int32))
+        lights = opencl.Shared(np.zeros(max(n_light, 1), device.LIGHT))
+        frame, empty = opencl.Shared(np.zeros(1, FRAME)), opencl.Shared(np.zeros(tiles, np.int32))
         scene, light = self._device, self._maps
         shadows = (
             (light.views.views, light.views.slots, light.views.triangles, light.texels)
@@ -226,12 +230,12 @@ class Renderer:
         draw = opencl.Call(
             "render/renderer.cl", "draw", (self._workers,), (1,),
             (views.views, views.triangles, views.slots, views.boxes, views.coarse, views.counters,
-             scene.mesh.faces, scene.records, scene.facets, scene.tables, scene.mdfs, scene.reflectances, lights,
-             *shadows, frame, *self._layers(), *(b for b, _ in results), empty),
+             scene.mesh.faces, scene.records, scene.facets, scene.tables, scene.mdfs, scene.reflectances,
+             lights.buffer, *shadows, frame.buffer, *self._layers(), *(b for b, _ in results), empty.buffer),
             self._defines,
         )  # fmt: skip
         return _Picture(
-            key=key, views=views, results=results, lights=lights, frame=frame, empty=empty, tiles=tiles, draw=draw,
+            key=key, views=views, results=results, lights=lights, frame=frame, empty=empty, draw=draw,
             shown=shown, rgba=rgba, depth=depth, owner=owner, shadowed=shadowed,
         )  # fmt: skip
 
@@ -255,10 +259,9 @@ class _Picture:
     key: tuple
     views: DeviceViews
     results: "list[tuple[cl.Buffer, Tensor]]"
-    lights: "cl.Buffer"
-    frame: "cl.Buffer"
-    empty: "cl.Buffer"
-    tiles: int
+    lights: opencl.Shared
+    frame: opencl.Shared
+    empty: opencl.Shared
     draw: opencl.Call
     shown: Tensor
     rgba: Tensor
@@ -266,6 +269,7 @@ class _Picture:
     owner: Tensor
     shadowed: Tensor
     outputs: int = 0
+    drawn_lights: tuple[Light, ...] | None = None
 
     def finished(self, camera: Camera, counts: dict[str, int], seconds: dict[str, float]) -> Picture:
         """Return the frame just drawn."""
