@@ -7,7 +7,7 @@
 
 // Projects one vertex for one view.
 __kernel void project(__global const View *restrict views, __global const double *restrict vertices,  // (V, 3)
-                      __global Projected *restrict out, __global Counters *restrict counters, const int count)
+                      __global Projected *restrict out, const int count)
 {
     const int i = get_global_id(0);
     if (i >= count) return;
@@ -22,7 +22,6 @@ __kernel void project(__global const View *restrict views, __global const double
     r.y = safe ? (int)rint(y * SUBPIXELS) : 0;
     r.state = (ahead ? AHEAD : 0) | (safe ? SAFE : 0);
     r.pad = 0;
-    if (!ahead) counters[get_global_id(1)].behind_near = 1;
     out[view->vertices + i] = r;
 }
 
@@ -34,8 +33,9 @@ __kernel void set_up(__global const View *restrict views, __global const Project
                      __global int *restrict boxes,         // (4, slots) per view: low x, low y, -high x, -high y
                      __global int *restrict coarse,        // (4, slots / 16)
                      __global uchar *restrict crossing,    // (padded faces) per view
-                     __global Counters *restrict counters, const int count, const int padded, const int stride,
-                     const int cull)
+                     __global Counters *restrict counters,
+                     __global const int *restrict objects,  // (view, object) whether it lies beside the view
+                     const int count, const int padded, const int stride, const int n_object)
 {
     const int v = get_global_id(0);
     if (16 * v >= padded) return;
@@ -46,11 +46,13 @@ __kernel void set_up(__global const View *restrict views, __global const Project
     __global int *box_of = boxes + 4 * view->slots;
     __global int *coarse_of = coarse + get_global_id(1) * 4 * coarse_stride;
     int around[4] = {LIMIT, LIMIT, LIMIT, LIMIT};
-    int behind = 0, cut = 0, drawn = 0, whole = 0;
+    int behind = 0, cut = 0, drawn = 0, whole = 0, beside = 0, turned = 0;
     for (int lane = 0; lane < 16; lane++) {
         const int f = 16 * v + lane, s = view->slots + f;
         int box[4] = {LIMIT, LIMIT, LIMIT, LIMIT}, crosses = 0;
-        if (f < count) {
+        if (f < count && objects[get_global_id(1) * n_object + tags[f].y]) {
+            beside++;
+        } else if (f < count) {
             int x[3], y[3], ahead = 0, safe = 0, front = 0;
             double q[3];
             for (int k = 0; k < 3; k++) {
@@ -63,13 +65,15 @@ __kernel void set_up(__global const View *restrict views, __global const Project
             behind += ahead == 0;
             cut += crosses;
             if (safe == 3 * SAFE) {
-                const int hidden = cull && (tags[f].x & CLOSED);
+                const int hidden = view->cull && (tags[f].x & CLOSED);
                 whole++;
                 double4 planes[3];
-                if (set_up_triangle(view, x, y, q, hidden, &front, triangles + s, planes, box)) {
+                const int made = set_up_triangle(view, x, y, q, hidden, &front, triangles + s, planes, box);
+                if (made > 0) {
                     keep_planes(slots + s, planes, box);
                     drawn++;
                 }
+                turned += made < 0;
                 slots[s].face = f;
                 slots[s].tag = tags[f].x | (front ? FRONT : 0);
                 slots[s].object = tags[f].y;
@@ -83,7 +87,9 @@ __kernel void set_up(__global const View *restrict views, __global const Project
     }
     for (int k = 0; k < 4; k++) coarse_of[k * coarse_stride + v] = around[k];
     if (drawn) atomic_add(&counted->drawn, drawn);
-    if (whole > drawn) atomic_add(&counted->degenerate, whole - drawn);
+    if (whole > drawn + turned) atomic_add(&counted->degenerate, whole - drawn - turned);
+    if (turned) atomic_add(&counted->turned, turned);
+    if (beside) atomic_add(&counted->beside, beside);
     if (cut) atomic_add(&counted->crossing, cut);
     if (behind) atomic_add(&counted->behind, behind);
 }
@@ -131,7 +137,8 @@ __kernel void cut_faces(__global const View *restrict views, __global const doub
                         __global const int *restrict faces, __global const int2 *restrict tags,
                         __global Triangle *restrict triangles, __global Slot *restrict slots, __global int *restrict boxes, __global int *restrict coarse,
                         __global const uchar *restrict crossing, __global Counters *restrict counters,
-                        const int count, const int padded, const int stride, const int cull)
+                        __global const int *restrict objects, const int count, const int padded, const int stride,
+                        const int n_object)
 {
     const int number = get_global_id(0);
     __global const View *view = views + number;
@@ -163,9 +170,9 @@ __kernel void cut_faces(__global const View *restrict views, __global const doub
                     y[c] = (int)rint(at->at[1] / at->at[2] * SUBPIXELS);
                     q[c] = view->perspective ? 1.0 / at->at[2] : at->at[3];
                 }
-                const int hidden = cull && (tags[f].x & CLOSED);
                 double4 planes[3];
-                if (set_up_triangle(view, x, y, q, hidden, &front, triangles + s, planes, box)) {
+                // The eye may be inside: nothing is left out.
+                if (set_up_triangle(view, x, y, q, 0, &front, triangles + s, planes, box)) {
                     // From the piece's own corners to those of the face.
                     for (int r = 0; r < 3; r++) {
                         const double part[3] = {planes[r].x, planes[r].y, planes[r].z};

@@ -10,7 +10,7 @@
 // What a frame asks for.
 typedef struct {
     int lights, ambient_paper, depths, outputs;  // outputs: OWNER also writes depth, objects and shadows
-    int capacity, tiles_capacity, stride, pitch;  // pitch: pixels of a row of the picture
+    int capacity, skips, stride, pitch;  // pitch: pixels of a row of the picture
     float ambient, background[3], rank_error;
     int pad[3];
 } Frame;
@@ -27,6 +27,20 @@ typedef struct {
     int pad[2];
 } Light;
 
+// What a frame is shaded with, and where it goes.
+typedef struct {
+    __global const Frame *frame;
+    __global const Reflectance *reflectances;
+    __global const Light *lights;
+    Shadows shadows;
+    __global uchar4 *shown;
+    __global float4 *rgba;
+    __global float *depth;
+    __global int *owner;
+    __global uchar *shadowed;
+} Target;
+
+// What the lanes of a stamp show.
 typedef struct {
     Surface at;
     Vector3 position;
@@ -126,10 +140,84 @@ static void shade_object(const Place *place, __global const Reflectance *reflect
     }
 }
 
+// Four colours as they are shown: exposure 0, clipped, sRGB, as data/image.py does; log2 and 2^x are polynomials.
+static uchar16 encode(const float16 colour)
+{
+    float16 x = colour > 0.0f ? colour : (float16)0.0f;
+    x = x < 1.0f ? x : (float16)1.0f;
+    const int16 bits = as_int16(x + 1e-9f);
+    const float16 m = as_float16((bits & 0x7fffff) | 0x3f800000) - 1.0f;
+    float16 log2 = -0.0248255360f;
+    log2 = log2 * m + 0.1179165680f;
+    log2 = log2 * m - 0.2723536420f;
+    log2 = log2 * m + 0.4538504450f;
+    log2 = log2 * m - 0.7169698550f;
+    log2 = log2 * m + 1.4423896250f;
+    log2 = (TO_FLOAT((bits >> 23) - 127) + m * log2) * (1.0f / 2.4f);
+    const int16 whole = TO_INT(log2 - 0.5f);
+    const float16 f = log2 - TO_FLOAT(whole);
+    float16 exp2 = 1.8775767e-3f;
+    exp2 = exp2 * f + 8.9893397e-3f;
+    exp2 = exp2 * f + 5.5826318e-2f;
+    exp2 = exp2 * f + 2.4015361e-1f;
+    exp2 = exp2 * f + 6.9315308e-1f;
+    exp2 = exp2 * f + 9.9999994e-1f;
+    const float16 power = 1.055f * exp2 * as_float16((whole + 127) << 23) - 0.055f;
+    float16 shown = x <= 0.0031308f ? 12.92f * x : power;
+    shown.s3 = x.s3, shown.s7 = x.s7, shown.sb = x.sb, shown.sf = x.sf;
+    return __builtin_convertvector(TO_INT(shown * 255.0f + 0.5f), uchar16);
+}
+
+// Shades what the lanes of a stamp show and writes it.
+static void draw_stamp(const Place *place, const Target *target, const Rays *rays, const Seen *seen, int *spared)
+{
+    __global const Frame *frame = target->frame;
+    __global const Light *lights = target->lights;
+    const int shaded = seen->seen & ~seen->inside;
+    const int plane = frame->pitch * ((place->view->height + 3) & ~3);
+    float4 colour[16];  // rgb and whether an object is seen
+    const float4 background = {frame->background[0], frame->background[1], frame->background[2], 0.0f};
+    for (int l = 0; l < 16; l++) colour[l] = seen->seen >> l & 1 ? (float4)(0.0f, 0.0f, 0.0f, 1.0f) : background;
+    int blocked[MAX_LIGHTS];
+    const float16 d = from_bits(shaded) ? seen->depth.vector : (float16)0.0f;
+    const Vector3 receiver = {rays->origin.x + d * rays->direction.x, rays->origin.y + d * rays->direction.y,
+                              rays->origin.z + d * rays->direction.z};
+    for (int i = 0; i < frame->lights; i++) {
+        blocked[i] = shaded ? blocked_from(&target->shadows, lights[i].first_face, lights[i].faces, &receiver, shaded) : 0;
+        if (!(frame->outputs & OWNER)) continue;
+        for (int l = 0; l < 16; l++)
+            target->shadowed[i * plane + (rays->y + (l >> 2)) * frame->pitch + rays->x + (l & 3)] = blocked[i] >> l & 1;
+    }
+    for (int rest = shaded; rest;) {
+        const int object = seen->object.lane[__builtin_ctz(rest)];
+        int same = 0;
+        for (int b = rest; b; b &= b - 1) {
+            const int l = __builtin_ctz(b);
+            same |= seen->object.lane[l] == object ? 1 << l : 0;
+        }
+        shade_object(place, target->reflectances + object, lights, frame, rays, seen, same, blocked, colour, spared);
+        rest &= ~same;
+    }
+    const Ints objects = {from_bits(seen->inside) ? (int16)-2 : seen->object.vector};
+    for (int row = 0; row < 4; row++) {
+        const int first = (rays->y + row) * frame->pitch + rays->x;
+        if (frame->outputs & DISPLAY) {
+            *(__global uchar16 *)(target->shown + first) = encode(*(const float16 *)(colour + 4 * row));
+            continue;
+        }
+        for (int k = 0; k < 4; k++) target->rgba[first + k] = colour[4 * row + k];
+        if (frame->outputs & OWNER) {
+            *(__global float4 *)(target->depth + first) = *(const float4 *)(seen->depth.lane + 4 * row);
+            *(__global int4 *)(target->owner + first) = *(const int4 *)(objects.lane + 4 * row);
+        }
+    }
+}
+
 // What the rays of a stamp end on: the nearest of all stretches that stop them.
 static Seen look(const Place *place, const Rays *rays, __global const float16 *key, __global const int16 *slot,
-                 const int filled, const int lanes, const int depths, Tally *tally)
+                 const int filled, const int lanes, const Target *target, int *spared, Tally *tally)
 {
+    const int depths = target->frame->depths;
     Seen seen;
     seen.depth.vector = INFINITY;
     seen.object.vector = -1;
@@ -232,84 +320,16 @@ static Seen look(const Place *place, const Rays *rays, __global const float16 *k
             seen.position.y = better ? position.y : seen.position.y;
             seen.position.z = better ? position.z : seen.position.z;
         }
+        if (!(place->skips & SKIP_LOSERS)) {
+            const Seen all = {s, position, found.object, {depth}, hit, found.inside & hit};
+            draw_stamp(place, target, rays, &all, spared);
+            tally->losers += __builtin_popcount(hit);
+        }
         // Nothing begins within the interval: what comes later lies behind.
         const int resolved = hit & ~found.crowded & ~found.single;
-        active &= ~resolved;
+        if (place->skips & SKIP_BEHIND) active &= ~resolved;
     }
     return seen;
-}
-
-// Four colours as they are shown: exposure 0, clipped, sRGB, as data/image.py does; log2 and 2^x are polynomials.
-static uchar16 encode(const float16 colour)
-{
-    float16 x = colour > 0.0f ? colour : (float16)0.0f;
-    x = x < 1.0f ? x : (float16)1.0f;
-    const int16 bits = as_int16(x + 1e-9f);
-    const float16 m = as_float16((bits & 0x7fffff) | 0x3f800000) - 1.0f;
-    float16 log2 = -0.0248255360f;
-    log2 = log2 * m + 0.1179165680f;
-    log2 = log2 * m - 0.2723536420f;
-    log2 = log2 * m + 0.4538504450f;
-    log2 = log2 * m - 0.7169698550f;
-    log2 = log2 * m + 1.4423896250f;
-    log2 = (TO_FLOAT((bits >> 23) - 127) + m * log2) * (1.0f / 2.4f);
-    const int16 whole = TO_INT(log2 - 0.5f);
-    const float16 f = log2 - TO_FLOAT(whole);
-    float16 exp2 = 1.8775767e-3f;
-    exp2 = exp2 * f + 8.9893397e-3f;
-    exp2 = exp2 * f + 5.5826318e-2f;
-    exp2 = exp2 * f + 2.4015361e-1f;
-    exp2 = exp2 * f + 6.9315308e-1f;
-    exp2 = exp2 * f + 9.9999994e-1f;
-    const float16 power = 1.055f * exp2 * as_float16((whole + 127) << 23) - 0.055f;
-    float16 shown = x <= 0.0031308f ? 12.92f * x : power;
-    shown.s3 = x.s3, shown.s7 = x.s7, shown.sb = x.sb, shown.sf = x.sf;
-    return __builtin_convertvector(TO_INT(shown * 255.0f + 0.5f), uchar16);
-}
-
-static void draw_stamp(const Place *place, __global const Frame *frame, __global const Reflectance *reflectances,
-                       __global const Light *lights, const Shadows *shadows, const Rays *rays, const int lanes,
-                       const Seen *seen, __global uchar4 *shown, __global float4 *rgba, __global float *depth, __global int *owner,
-                       __global uchar *shadowed, int *spared)
-{
-    const int shaded = seen->seen & ~seen->inside;
-    const int plane = frame->pitch * ((place->view->height + 3) & ~3);
-    float4 colour[16];  // rgb and whether an object is seen
-    const float4 background = {frame->background[0], frame->background[1], frame->background[2], 0.0f};
-    for (int l = 0; l < 16; l++) colour[l] = seen->seen >> l & 1 ? (float4)(0.0f, 0.0f, 0.0f, 1.0f) : background;
-    int blocked[MAX_LIGHTS];
-    const float16 d = from_bits(shaded) ? seen->depth.vector : (float16)0.0f;
-    const Vector3 receiver = {rays->origin.x + d * rays->direction.x, rays->origin.y + d * rays->direction.y,
-                              rays->origin.z + d * rays->direction.z};
-    for (int i = 0; i < frame->lights; i++) {
-        blocked[i] = shaded ? blocked_from(shadows, lights[i].first_face, lights[i].faces, &receiver, shaded) : 0;
-        if (!(frame->outputs & OWNER)) continue;
-        for (int l = 0; l < 16; l++)
-            shadowed[i * plane + (rays->y + (l >> 2)) * frame->pitch + rays->x + (l & 3)] = blocked[i] >> l & 1;
-    }
-    for (int rest = shaded; rest;) {
-        const int object = seen->object.lane[__builtin_ctz(rest)];
-        int same = 0;
-        for (int b = rest; b; b &= b - 1) {
-            const int l = __builtin_ctz(b);
-            same |= seen->object.lane[l] == object ? 1 << l : 0;
-        }
-        shade_object(place, reflectances + object, lights, frame, rays, seen, same, blocked, colour, spared);
-        rest &= ~same;
-    }
-    const Ints objects = {from_bits(seen->inside) ? (int16)-2 : seen->object.vector};
-    for (int row = 0; row < 4; row++) {
-        const int first = (rays->y + row) * frame->pitch + rays->x;
-        if (frame->outputs & DISPLAY) {
-            *(__global uchar16 *)(shown + first) = encode(*(const float16 *)(colour + 4 * row));
-            continue;
-        }
-        for (int k = 0; k < 4; k++) rgba[first + k] = colour[4 * row + k];
-        if (frame->outputs & OWNER) {
-            *(__global float4 *)(depth + first) = *(const float4 *)(seen->depth.lane + 4 * row);
-            *(__global int4 *)(owner + first) = *(const int4 *)(objects.lane + 4 * row);
-        }
-    }
 }
 
 // A stamp where nothing is seen.
@@ -348,8 +368,9 @@ static INNER void draw_tiles(const int worker, __global const View *restrict vie
                              __global int *restrict owner, __global uchar *restrict shadowed,
                              __global int *restrict empty)
 {
-    const Place place = {view, slots, faces, records, facets, tables, mdfs, counters->behind_near};
-    const Shadows shadows = {light_views, light_slots, light_triangles, texels};
+    const Place place = {view, slots, faces, records, facets, tables, mdfs, !view->outside, 1, frame->skips};
+    const Target target = {frame,  reflectances, lights, {light_views, light_slots, light_triangles, texels},
+                           shown, rgba,         depth,  owner, shadowed};
     const int across = (view->width + TILE - 1) / TILE, down = (view->height + TILE - 1) / TILE;
     Lists lists;
     Tally tally = {0};
@@ -367,7 +388,7 @@ static INNER void draw_tiles(const int worker, __global const View *restrict vie
             continue;  // the host gives more room and asks again
         int covered = 0;
         for (int s = 0; s < STAMPS * STAMPS; s++) covered |= lists.filled[s];
-        if (!covered && empty[tile]) {
+        if (!covered && empty[tile] && frame->skips & SKIP_EMPTY_TILES) {
             skipped++;
             continue;
         }
@@ -387,9 +408,9 @@ static INNER void draw_tiles(const int worker, __global const View *restrict vie
             tally.deepest = MAX(tally.deepest, filled);
             for (int k = 0; k < filled; k++)
                 tally.fragments += __builtin_popcount(lanes & to_bits(key_of[k] < INFINITY));
-            const Seen seen = look(&place, &rays, key_of, slot + lists.begin[s], filled, lanes, frame->depths, &tally);
-            draw_stamp(&place, frame, reflectances, lights, &shadows, &rays, lanes, &seen, shown, rgba, depth, owner,
-                       shadowed, &spared);
+            const Seen seen = look(&place, &rays, key_of, slot + lists.begin[s], filled, lanes, &target, &spared,
+                                   &tally);
+            draw_stamp(&place, &target, &rays, &seen, &spared);
         }
     }
     count_up(counters, &tally);

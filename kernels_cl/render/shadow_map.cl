@@ -79,7 +79,7 @@ static INNER void draw_light_tiles(const int worker, __global const View *restri
                                    __global Counters *restrict counters, __global const int *restrict faces,
                                    __global const float16 *restrict records, __global const Facet *restrict facets,
                                    __global const uchar *restrict tables, __global const Mdf *restrict mdfs,
-                                   const int number, const int stride, const int capacity,
+                                   const int number, const int stride, const int capacity, const int skips,
                                    __global float16 *restrict key, __global int16 *restrict slot,
                                    __global Texel *restrict texels)
 {
@@ -87,7 +87,7 @@ static INNER void draw_light_tiles(const int worker, __global const View *restri
     __global Counters *counted = counters + number;
     const int coarse_stride = ((stride >> 4) + 15) >> 4;
     const Place place = {view, slots + view->slots, faces, records, facets, tables, mdfs,
-                         counted->behind_near};
+                         !view->outside, 0, skips};
     const int across = (view->width + TILE - 1) / TILE, down = (view->height + TILE - 1) / TILE;
     Lists lists;
     Tally tally = {0};
@@ -129,10 +129,10 @@ void draw_light(__global const View *restrict views, __global const Triangle *re
                 __global Counters *restrict counters, __global const int *restrict faces,
                 __global const float16 *restrict records, __global const Facet *restrict facets,
                 __global const uchar *restrict tables, __global const Mdf *restrict mdfs, const int number,
-                const int stride, const int capacity,
+                const int stride, const int capacity, const int skips,
                 __global float16 *restrict key, __global int16 *restrict slot,  // layers of the tiles at work
                 __global Texel *restrict texels)
 {
     draw_light_tiles(get_group_id(0), views, triangles, slots, boxes, coarse, counters, faces, records, facets,
-                     tables, mdfs, number, stride, capacity, key, slot, texels);
+                     tables, mdfs, number, stride, capacity, skips, key, slot, texels);
 }

@@ -1,5 +1,5 @@
 import math
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import pytest
 import torch
@@ -15,7 +15,7 @@ from torchmeso.meso import bake_btf, bake_mdf, generators
 from torchmeso.meso.bake_btf import BtfOptions
 from torchmeso.meso.bake_mdf import MdfOptions, RayCastMdf
 from torchmeso.render import frame
-from torchmeso.render.frame import FrameOptions
+from torchmeso.render.frame import FrameOptions, Skips
 from torchmeso.render.renderer import Renderer
 from torchmeso.render.scene import Material, Object, Scene
 
@@ -88,9 +88,11 @@ def test_the_same_picture_as_torch(silhouette, light, still_life, device):
     assert (exact.shadowed != fast.shadowed).sum() <= 4
     near = (exact.depth - fast.depth).abs() <= 1e-4 * exact.depth
     assert (~near & exact.depth.isfinite()).sum() <= 4
-    for name in ("fragments", "layers", "pixels with a fragment"):
-        assert exact.counts[name] == fast.counts[name], name
-    assert 0 < fast.counts["intervals"] <= exact.counts["intervals"]  # those behind a resolved pixel are skipped
+    assert exact.counts["pixels with a fragment"] == fast.counts["pixels with a fragment"]
+    if silhouette != "none":  # without depth, triangles turned away are not drawn
+        assert exact.counts["fragments"] == fast.counts["fragments"]
+        assert exact.counts["layers"] == fast.counts["layers"]
+        assert 0 < fast.counts["intervals"] <= exact.counts["intervals"]  # those behind a resolved pixel are skipped
 
 
 @pytest.mark.parametrize("rule", ["add", "paper"])
@@ -180,3 +182,70 @@ def test_bounds_of_component_groups_hold(device):
         part = torch.einsum("nkc,vk->vnc", E[:, 4 * g : 4 * g + 4], weights[:, 4 * g : 4 * g + 4])
         assert (part.abs().amax((1, 2)) <= bounds[:, g] * (1 + 1e-5)).all()
     assert math.isfinite(float(bounds.max()))
+
+
+SKIPS = {
+    "frustum": ("triangles beside the view", "curved"),
+    "empty_tiles": ("tiles that stayed empty", "curved"),
+    "hidden": ("triangles turned away", "none"),
+    "behind": ("stretches behind a resolved pixel", "curved"),
+    "bounds": ("intervals passed by the facets alone", "paper"),
+    "plain": ("frames without silhouette code", "curved"),
+    "losers": ("pixels shaded for nothing", "curved"),
+    "resting": ("shadow maps kept", "curved"),
+    "unlit": ("lights left out", "curved"),
+}
+"""Each skip, what counts it, and a silhouette that it works with; `losers` counts what is done without it."""
+
+
+def test_every_skip_is_here():
+    assert set(SKIPS) == {f.name for f in fields(Skips)}
+
+
+@pytest.mark.parametrize("name", SKIPS)
+def test_a_skip_is_wired_and_changes_nothing(name, still_life, device):
+    """It counts while it is on, does not while it is off, and the picture is the same bit for bit."""
+    counter, silhouette = SKIPS[name]
+    objects = still_life
+    if name == "plain":
+        objects = tuple(replace(o, material=replace(o.material, mdf=None)) for o in objects)
+    # Two spheres one behind the other overlap; one object stands behind the eye; one light shines away.
+    ball = shapes.sphere(radius=0.35, triangles=200)
+    extra = (
+        Object(mesh=moved(ball, x=0.8, y=0.3, z=0.9), material=still_life[0].material),
+        Object(mesh=moved(ball, x=0.8, y=0.32, z=0.5), material=still_life[2].material),
+        Object(mesh=moved(ball, x=9.0, z=9.0), material=Material()),
+    )
+    away = SpotLight(
+        position=torch.tensor([0.0, 5.0, 0.0]), axis=torch.tensor([0.0, 1.0, 0.0]), intensity=torch.full((3,), 50.0)
+    )
+    scene = Scene(objects=(*objects, *extra) if name != "plain" else objects, lights=(*LIGHTS["sun"], away))
+    view = camera((4.5, 6.0, 10.5), size=256) if name == "empty_tiles" else camera((1.5, 2.0, 3.5), size=160)
+    pictures, counts = [], []
+    for on in (True, False):
+        options = FrameOptions(silhouette=silhouette, shadow_map_size=128, skips=replace(Skips(), **{name: on}))
+        renderer = Renderer(scene, options)
+        renderer.render(view)
+        pictures.append(renderer.render(view))
+        counts.append(renderer.counts[counter])
+    assert torch.equal(pictures[0].rgb, pictures[1].rgb)
+    assert torch.equal(pictures[0].owner, pictures[1].owner)
+    used, unused = reversed(counts) if name == "losers" else counts
+    assert used > unused
+    if name != "losers":
+        assert unused == 0
+
+
+def test_ranks_that_add_less_than_the_error(device):
+    table = bake_btf.in_memory(
+        generators.brick(), BtfOptions(texels=8, lights="grid(6, 3, 80)", views="grid(6, 3, 80)", samples=1, bounces=0)
+    )
+    material = Material(btf=eigen.fit(table, EigenOptions(rank=12)))
+    scene = Scene(objects=(Object(mesh=shapes.sphere(triangles=500), material=material),), lights=LIGHTS["sun"])
+    exact = Renderer(scene).render(camera((0, 0, 4)))
+    assert exact.counts["groups of components spared"] == 0
+    for error in (0.02, 0.2):
+        rough = Renderer(scene, FrameOptions(rank_error=error)).render(camera((0, 0, 4)))
+        assert rough.counts["groups of components spared"] > 0
+        # Two groups can be left out, and light and ambient both read the model.
+        assert (rough.rgb - exact.rgb).abs().max() <= 2 * error * (1 + scene.ambient)

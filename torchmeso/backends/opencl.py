@@ -43,7 +43,6 @@ WIDE = (
 processor, which for one younger than the compiler is AVX2; vectors of sixteen are then split in two."""
 
 
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DeviceInfo:
     """What `torchmeso info --device` prints of one OpenCL device.

@@ -26,6 +26,33 @@ MEMORY_LIMIT = 16 << 30
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Skips:
+    """What the kernels leave out because it cannot change the picture; each can be switched off to show that.
+
+    Attributes:
+        frustum: objects that lie beside the view are not set up.
+        empty_tiles: tiles that show the background already are not written again.
+        hidden: triangles turned away are not drawn where no surface has depth.
+        behind: stretches that begin behind what a pixel already shows are not looked at.
+        bounds: intervals too long to be passed through ask for no depth.
+        plain: without any mesostructure no silhouette code runs.
+        losers: only what is seen is shaded.
+        resting: shadow maps stay while light and objects do.
+        unlit: lights that reach no object are left out.
+    """
+
+    frustum: bool = True
+    empty_tiles: bool = True
+    hidden: bool = True
+    behind: bool = True
+    bounds: bool = True
+    plain: bool = True
+    losers: bool = True
+    resting: bool = True
+    unlit: bool = True
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class FrameOptions:
     """What a frame does.
 
@@ -34,15 +61,21 @@ class FrameOptions:
             "none" renders the BTF on the bare mesh.
         shadows: whether objects cast shadows.
         shadow_map_size: texels along a side of a shadow map.
+        rank_error: groups of four components of an eigen BTF are left out where they add at most this to T; the one
+            skip that changes the picture, and only on opencl.
+        skips: what is left out without changing it; on opencl.
     """
 
     silhouette: Silhouette = "curved"
     shadows: bool = True
     shadow_map_size: int = 1024
+    rank_error: float = 0.0
+    skips: Skips = Skips()
 
     def __post_init__(self) -> None:
         """Raise ConfigError for a size out of range."""
         check_range("render.shadow_map_size", self.shadow_map_size, 8, 16384)
+        check_range("render.rank_error", self.rank_error, 0, 1e6)
 
 
 def render(scene: Scene, camera: Camera, options: FrameOptions | None = None) -> Picture:

@@ -44,13 +44,14 @@ TRIANGLE_BYTES, SLOT_BYTES, PROJECTED_BYTES, LIMIT = 96, 64, 24, 1 << 30
 
 VIEW = np.dtype(
     [("eye", "f8", 3), ("axes", "f8", (3, 3)), ("pixel_size", "f8"), ("near", "f8")]
-    + [(name, "i4") for name in ("width", "height", "perspective", "vertices", "slots", "texels")]
+    + [(name, "i4") for name in ("width", "height", "perspective", "vertices", "slots", "texels", "cull", "outside")]
 )
 """A camera as the kernels read it."""
 
 COUNTERS = (
-    "used", "vectors", "slots", "tile", "behind_near", "crossing", "behind", "degenerate", "drawn", "fragments",
+    "used", "vectors", "slots", "tile", "crossing", "behind", "degenerate", "drawn", "fragments",
     "deepest", "covered", "intervals", "deep", "carved", "inside", "hidden", "looked", "spared", "empty_tiles",
+    "beside", "turned", "losers", "bounded",
 )  # fmt: skip
 """What the kernels count, in the order of `Counters` in kernels_cl/render/rasterize.clh; padded to 32."""
 
@@ -297,7 +298,8 @@ class DeviceMesh(NamedTuple):
         vertices: (V, 3) float64.
         faces: (F, 3) int32.
         tags: (F, 2) int32: component << 2 | 2 where it is closed; object.
-        corners: (8, 3) float64 of the box around all vertices.
+        boxes: (object, 8, 3) float64 corners of the box around each object.
+        bodies: (object,) whether an object has closed components.
         n_vertex: V.
         n_face: F.
     """
@@ -305,7 +307,8 @@ class DeviceMesh(NamedTuple):
     vertices: "cl.Buffer"
     faces: "cl.Buffer"
     tags: "cl.Buffer"
-    corners: Float[np.ndarray, "8 3"]
+    boxes: Float[np.ndarray, "object 8 3"]
+    bodies: Bool[np.ndarray, "object"]
     n_vertex: int
     n_face: int
 
@@ -333,34 +336,43 @@ def upload_mesh(
         BackendError: there is no OpenCL device.
     """
     tags = torch.zeros(len(faces), 2, dtype=torch.int32) if tags is None else tags
-    box = torch.stack([vertices.amin(0), vertices.amax(0)]).double() if len(vertices) else torch.zeros(2, 3).double()
-    corners = torch.stack(torch.meshgrid(*box.unbind(1), indexing="ij"), -1).reshape(8, 3)
+    boxes, bodies = [], []
+    for i in range(int(tags[:, 1].max()) + 1 if len(tags) else 1):
+        p = vertices[faces[tags[:, 1] == i].unique()].double()
+        bodies.append(bool((tags[tags[:, 1] == i, 0] & 2).any()))
+        box = torch.stack([p.amin(0), p.amax(0)]) if len(p) else torch.zeros(2, 3, dtype=torch.float64)
+        boxes.append(torch.stack(torch.meshgrid(*box.unbind(1), indexing="ij"), -1).reshape(8, 3).numpy())
     return DeviceMesh(
         opencl.upload(vertices.double().numpy()), opencl.upload(faces.int().numpy()),
-        opencl.upload(tags.int().numpy()), corners.numpy(), len(vertices), len(faces),
+        opencl.upload(tags.int().numpy()), np.stack(boxes), np.array(bodies), len(vertices), len(faces),
     )  # fmt: skip
 
 
-def _whole(camera: Camera, corners: Float[np.ndarray, "n 3"]) -> bool:
-    """Return whether nothing between `corners` can cross the near plane or the guard band; in numpy, for its speed."""
-    x, y, back = camera.axes.double().numpy() @ (corners - camera.eye.double().numpy()).T
+def _overlap(camera: Camera, boxes: Float[np.ndarray, "object 8 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return whether each box lies beside the view, ahead of the eye, and also within the guard band.
+
+    In numpy, for its speed on a few numbers.
+    """
+    x, y, back = np.moveaxis((boxes - camera.eye.double().numpy()) @ camera.axes.double().numpy().T, -1, 0)
     w = -back if camera.projection == "perspective" else np.ones_like(back)
-    reach = GUARD_BAND - max(camera.width, camera.height)
-    inside = (np.abs(x) < reach * camera.pixel_size * w) & (np.abs(y) < reach * camera.pixel_size * w)
-    return bool(((-back > camera.near) & inside).all())
+    ahead = -back > camera.near
+    size = camera.pixel_size * w
+    right, top = (camera.width / 2 + 1) * size, (camera.height / 2 + 1) * size
+    beside = (x < -right).all(1) | (x > right).all(1) | (y < -top).all(1) | (y > top).all(1) | ~ahead.any(1)
+    reach = (GUARD_BAND - max(camera.width, camera.height)) * size
+    return beside, ahead.all(1), (ahead & (np.abs(x) < reach) & (np.abs(y) < reach)).all(1)
 
 
 class DeviceViews:
     """Cameras on one mesh: its triangles on their screens, on the device."""
 
-    def __init__(self, mesh: DeviceMesh, count: int, *, cut_room: int = 0, cull: bool = False):
+    def __init__(self, mesh: DeviceMesh, count: int, *, cut_room: int = 0):
         """Make room for `count` views.
 
         Args:
             mesh: what is seen.
             count: cameras.
             cut_room: triangles that faces may become which cross the near plane or the guard band.
-            cull: whether faces of closed components that are turned away are left out.
         """
         self.mesh, self.count, self.may_cut, self._was_cut = mesh, count, True, True
         self.padded = -(-max(mesh.n_face, 1) // 16) * 16
@@ -368,6 +380,7 @@ class DeviceViews:
         vectors = -(-(self.stride // 16) // 16) * 16
         self._views = opencl.Shared(np.zeros(count, VIEW))
         self._counters = opencl.Shared(np.zeros((count, 32), np.int32))
+        self._beside = opencl.Shared(np.zeros((count, len(mesh.boxes)), np.int32))
         self.views, self.counters = self._views.buffer, self._counters.buffer
         self.projected = opencl.allocate(count * mesh.n_vertex * PROJECTED_BYTES)
         self.triangles = opencl.allocate(count * self.stride * TRIANGLE_BYTES)
@@ -375,13 +388,13 @@ class DeviceViews:
         self.boxes = opencl.upload(np.full(count * self.stride * 4, LIMIT, np.int32))
         self.coarse = opencl.upload(np.full(count * vectors * 4, LIMIT, np.int32))
         crossing = opencl.allocate(count * self.padded)
-        sizes = (np.int32(mesh.n_face), np.int32(self.padded), np.int32(self.stride), np.int32(cull))
-        screen = (self.triangles, self.slots, self.boxes, self.coarse, crossing, self.counters)
+        sizes = (np.int32(mesh.n_face), np.int32(self.padded), np.int32(self.stride), np.int32(len(mesh.boxes)))
+        screen = (self.triangles, self.slots, self.boxes, self.coarse, crossing, self.counters, self._beside.buffer)
         path = "render/rasterize.cl"
         self.steps = {
             "vertices": opencl.Call(
                 path, "project", (-(-mesh.n_vertex // 64) * 64, count), (64, 1),
-                (self.views, mesh.vertices, self.projected, self.counters, np.int32(mesh.n_vertex)),
+                (self.views, mesh.vertices, self.projected, np.int32(mesh.n_vertex)),
             ),
             "triangles": opencl.Call(
                 path, "set_up", (-(-(self.padded // 16) // 8) * 8, count), (8, 1),
@@ -392,31 +405,37 @@ class DeviceViews:
             ),
         }  # fmt: skip
 
-    def aim(self, cameras: Sequence[Camera], *, taken: int) -> None:
+    def aim(self, cameras: Sequence[Camera], *, taken: int, frustum: bool = True, cull: bool = False) -> None:
         """Set the cameras and put the set-up of all triangles into the queue.
 
         Args:
             cameras: `count` of them.
             taken: layers that the tiles begin with.
+            frustum: whether objects beside a view are left out.
+            cull: whether faces of bodies that are turned away are left out, as long as the eye is outside.
         """
-        texels = 0
+        texels, self.may_cut = 0, False
         for i, (r, camera) in enumerate(zip(self._views.array, cameras, strict=True)):
             r["eye"], r["axes"] = camera.eye.double().numpy(), camera.axes.double().numpy()
             r["pixel_size"], r["near"] = camera.pixel_size, camera.near
             r["width"], r["height"] = camera.width, camera.height
             r["perspective"] = camera.projection == "perspective"
             r["vertices"], r["slots"] = i * self.mesh.n_vertex, i * self.stride
-            r["texels"] = texels
+            beside, ahead, whole = _overlap(camera, self.mesh.boxes)
+            outside = bool((ahead | beside | ~self.mesh.bodies).all())
+            r["texels"], r["cull"], r["outside"] = texels, cull and outside, outside
+            # What lies beside is behind the eye as a whole, or needs no cutting: only what is seen can cross.
+            self._beside.array[i] = beside & frustum
+            self.may_cut |= not (whole | (beside & frustum)).all()
             texels += camera.width * camera.height
         counters = self._counters.array
         counters[:] = 0
         counters[:, COUNTERS.index("used")] = taken
         counters[:, COUNTERS.index("vectors")] = self.padded // 16
-        self._views.send()
-        self._counters.send()
+        for shared in (self._views, self._counters, self._beside):
+            shared.send()
         self.steps["vertices"]()
         self.steps["triangles"]()
-        self.may_cut = not all(_whole(camera, self.mesh.corners) for camera in cameras)
         if self.may_cut or self._was_cut:
             self.steps["cut triangles"]()
         self._was_cut = self.may_cut

@@ -20,7 +20,7 @@ from torch import Tensor
 from torchmeso.backends import opencl
 from torchmeso.errors import BackendError, check_memory
 from torchmeso.geometry.camera import Camera
-from torchmeso.geometry.light import Light
+from torchmeso.geometry.light import DirectionalLight, Light, SpotLight
 from torchmeso.render import device, shadow_map
 from torchmeso.render.film import Picture
 from torchmeso.render.frame import MEMORY_LIMIT, FrameOptions
@@ -38,7 +38,7 @@ DETAILS, DISPLAY = 1, 2
 
 FRAME = np.dtype(
     [(name, "i4") for name in ("lights", "ambient_paper", "depths", "outputs")]
-    + [(name, "i4") for name in ("capacity", "tiles_capacity", "stride", "pitch")]
+    + [(name, "i4") for name in ("capacity", "skips", "stride", "pitch")]
     + [("ambient", "f4"), ("background", "f4", 3), ("rank_error", "f4"), ("pad", "i4", 3)]
 )
 
@@ -57,10 +57,13 @@ class Renderer:
         self._scene, self._world = scene, assemble(scene)
         silhouettes = self.options.silhouette != "none"
         self._device = device.upload(scene, self._world, silhouettes=silhouettes, ambient=scene.ambient > 0)
-        mode = {"none": 0, "paper": 1, "curved": 2}[self.options.silhouette] if self._device.textured else 0
+        self._skips = self.options.skips
+        textured = self._device.textured or not self._skips.plain
+        mode = {"none": 0, "paper": 1, "curved": 2}[self.options.silhouette] if textured else 0
+        self._plain = mode == 0 and silhouettes
         self._defines = (f"-DSILHOUETTE={mode}",)
         self._workers = opencl.units()
-        self._extra, self._cut_room = 4096, 0
+        self._extra, self._cut_room, self._light_room = 4096, 0, 1
         self._lists: tuple[cl.Buffer, cl.Buffer] | None = None
         self._picture: _Picture | None = None
         self._maps: _Maps | None = None
@@ -96,7 +99,9 @@ class Renderer:
         return picture.shown[: camera.height, : camera.width]
 
     def _frame(self, camera: Camera, lights: tuple[Light, ...] | None, outputs: int) -> "_Picture":
-        lights = self._scene.lights if lights is None else lights
+        given = lights = self._scene.lights if lights is None else lights
+        reaching = [i for i, light in enumerate(lights) if not self._skips.unlit or self._reaches(light)]
+        lights = tuple(lights[i] for i in reaching) if len(reaching) < len(lights) else lights
         if len(lights) > MAX_LIGHTS:
             raise BackendError(
                 f"opencl: expected at most {MAX_LIGHTS} lights, got {len(lights)}; use the torch backend"
@@ -109,10 +114,31 @@ class Renderer:
             if self._fits(counts + (self._maps.views.counts() if drawn and self._maps else [])):
                 break
         opencl.read(picture.results[:1] if outputs == DISPLAY else picture.results[1:])
+        picture.lit = (len(given), reaching)
+        faces = sum(self._maps.faces) if self._maps else 0
         self.counts = _named(counts[0], camera) | {
-            "shadow maps drawn": sum(self._maps.faces) if drawn and self._maps else 0
+            "lights left out": len(given) - len(reaching),
+            "shadow maps drawn": faces if drawn else 0,
+            "shadow maps kept": 0 if drawn else faces,
+            "frames without silhouette code": int(self._plain),
         }
         return picture
+
+    def _reaches(self, light: Light) -> bool:
+        """Return whether any light falls on any object; in doubt it does."""
+        power = light.irradiance if isinstance(light, DirectionalLight) else light.intensity
+        if not bool((power > 0).any()):
+            return False
+        if not isinstance(light, SpotLight):
+            return True
+        boxes = self._device.mesh.boxes
+        centre = boxes.mean(1)
+        radius = np.linalg.norm(boxes - centre[:, None], axis=-1).max(1)
+        way = centre - light.position.double().numpy()
+        distance = np.maximum(np.linalg.norm(way, axis=-1), 1e-30)
+        off_axis = np.arccos(np.clip(way @ light.axis.double().numpy() / distance, -1, 1))
+        seen_under = np.arcsin(np.minimum(radius / distance, 1))
+        return bool((off_axis <= np.radians(light.outer_deg) + seen_under + 1e-6).any())
 
     def milliseconds(self) -> dict[str, float]:
         """Return the time of each kernel in the last frame; of the shadow maps' where they were last drawn."""
@@ -152,7 +178,7 @@ class Renderer:
         if not self.options.shadows or not lights:
             self._maps = None
             return False
-        if self._maps is not None and self._maps.lights is lights:
+        if self._maps is not None and self._skips.resting and _same(self._maps.lights, lights):
             return False
         faces = [shadow_map.cameras(self._world, light, self.options.shadow_map_size) for light in lights]
         sizes = tuple((camera.width, camera.height) for views in faces for camera in views)
@@ -160,7 +186,7 @@ class Renderer:
             self._maps = self._make_maps(sizes)
         maps = self._maps
         maps.lights, maps.faces = lights, [len(views) for views in faces]
-        maps.views.aim([camera for views in faces for camera in views], taken=self._taken)
+        maps.views.aim([camera for views in faces for camera in views], taken=self._taken, frustum=self._skips.frustum)
         for call in maps.draw:
             call()
         return True
@@ -174,7 +200,7 @@ class Renderer:
                 "render/shadow_map.cl", "draw_light", (self._workers,), (1,),
                 (views.views, views.triangles, views.slots, views.boxes, views.coarse, views.counters,
                  scene.mesh.faces, scene.records, scene.facets, scene.tables, scene.mdfs, np.int32(number),
-                 np.int32(views.stride), capacity, *self._layers(), texels),
+                 np.int32(views.stride), capacity, np.int32(self._skip_bits()), *self._layers(), texels),
                 self._defines,
             )
             for number in range(len(sizes))
@@ -182,21 +208,21 @@ class Renderer:
         return _Maps(views=views, texels=texels, draw=draw, sizes=sizes)
 
     def _draw_picture(self, camera: Camera, lights: tuple[Light, ...], outputs: int) -> "_Picture":
-        key = (camera.width, camera.height, len(lights), self._maps.sizes if self._maps else None)
+        self._light_room = max(self._light_room, len(lights))
+        key = (camera.width, camera.height, self._light_room, self._maps.sizes if self._maps else None)
         if self._picture is None or self._picture.key != key:
             self._picture = self._make_picture(key)
         picture, scene, maps = self._picture, self._scene, self._maps
-        if lights is not picture.drawn_lights:
-            picture.lights.array[: max(len(lights), 1)] = device.light_records(lights)
-            picture.drawn_lights = lights
         records = picture.lights.array
+        records[: max(len(lights), 1)] = device.light_records(lights)
         if maps is not None:
-            records["faces"] = maps.faces
-            records["first_face"] = np.cumsum([0, *maps.faces[:-1]])
+            records["faces"][: len(lights)] = maps.faces
+            records["first_face"][: len(lights)] = np.cumsum([0, *maps.faces[:-1]])
         frame = picture.frame.array
         frame["lights"], frame["ambient_paper"] = len(lights), scene.ambient_rule == "paper"
         frame["depths"], frame["outputs"] = outputs == DETAILS or maps is not None, outputs
         frame["capacity"], frame["stride"] = self._taken + self._extra, picture.views.stride
+        frame["skips"], frame["rank_error"] = self._skip_bits(), self.options.rank_error
         frame["pitch"] = picture.rgba.shape[1]
         frame["ambient"], frame["background"] = scene.ambient, scene.background
         picture.lights.send()
@@ -205,9 +231,16 @@ class Renderer:
             picture.empty.array[:] = 0
             picture.empty.send()
             picture.outputs = outputs
-        picture.views.aim([camera], taken=self._taken)
+        # Where no surface has depth, what is turned away can hide nothing.
+        cull = self._skips.hidden and self._defines == ("-DSILHOUETTE=0",)
+        picture.views.aim([camera], taken=self._taken, frustum=self._skips.frustum, cull=cull)
         picture.draw()
         return picture
+
+    def _skip_bits(self) -> int:
+        """Return the skips as `SKIP_*` in kernels_cl/render/silhouette.clh."""
+        s = self._skips
+        return s.empty_tiles | s.behind << 1 | s.bounds << 2 | s.losers << 3
 
     def _make_picture(self, key: tuple) -> "_Picture":
         width, height, n_light, _ = key
@@ -269,19 +302,27 @@ class _Picture:
     owner: Tensor
     shadowed: Tensor
     outputs: int = 0
-    drawn_lights: tuple[Light, ...] | None = None
+    lit: tuple[int, list[int]] = (0, [])
 
     def finished(self, camera: Camera, counts: dict[str, int], seconds: dict[str, float]) -> Picture:
         """Return the frame just drawn."""
         height, width = camera.height, camera.width
+        count, reaching = self.lit
+        shadowed = torch.zeros(count, height, width, dtype=torch.bool)
+        shadowed[reaching] = self.shadowed[: len(reaching), :height, :width].bool()
         return Picture(
             rgb=self.rgba[:height, :width, :3],
             depth=self.depth[:height, :width],
             owner=self.owner[:height, :width].long(),
-            shadowed=self.shadowed[: self.key[2], :height, :width].bool(),
+            shadowed=shadowed,
             counts=counts,
             seconds=seconds,
         )
+
+
+def _same(a: tuple[Light, ...], b: tuple[Light, ...]) -> bool:
+    """Return whether two sets of lights are the same, whether or not they are the same objects."""
+    return a is b or device.light_records(a).tobytes() == device.light_records(b).tobytes()
 
 
 def _named(counts: dict[str, int], camera: Camera) -> dict[str, int]:
@@ -294,6 +335,7 @@ def _named(counts: dict[str, int], camera: Camera) -> dict[str, int]:
         "pixels": camera.width * camera.height,
         "intervals": counts["intervals"],
         "intervals passed by their length": counts["deep"],
+        "intervals passed by the facets alone": counts["bounded"],
         "intervals carved": counts["carved"],
         "pixels inside an object": counts["inside"],
         "depth look-ups": counts["looked"],
@@ -302,4 +344,7 @@ def _named(counts: dict[str, int], camera: Camera) -> dict[str, int]:
         "triangles behind the eye": counts["behind"],
         "tiles that stayed empty": counts["empty_tiles"],
         "groups of components spared": counts["spared"],
+        "triangles beside the view": counts["beside"],
+        "triangles turned away": counts["turned"],
+        "pixels shaded for nothing": max(counts["losers"] - counts["covered"], 0),
     }

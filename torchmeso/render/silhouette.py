@@ -134,6 +134,8 @@ def find_candidates(
             look-ups of everything that hits anyway.
     """
     found, single = find_intervals(layers, world)
+    if depths:
+        found, single = _opaque(scene, world, layers, found, single, silhouette)
     has_front, has_back = found.front >= 0, found.back >= 0
     t_front = torch.where(has_front, layers.t[found.front.clamp(min=0)] if len(layers.t) else 0, 0.0)
     near = camera.near * rays(camera, found.pixel)[2]
@@ -158,6 +160,21 @@ def find_candidates(
     t = torch.cat([t_front[hit], t_single])
     depth = torch.cat([t_front[hit] + d_front[hit], t_single + d_single])
     return Candidates(pixel, fragment, back, t, depth), counts
+
+
+def _opaque(
+    scene: Scene, world: World, layers: Layers, found: Intervals, single: Tensor, silhouette: Silhouette
+) -> tuple[Intervals, Tensor]:
+    """Take bodies whose surface has no depth as opaque: every front face stops a ray, whatever is behind it."""
+    plain = torch.tensor([silhouette == "none" or o.material.mdf is None for o in scene.objects])
+    face = layers.triangles.face[layers.triangle]
+    closed = world.closed[world.component[face]]
+    front = layers.triangles.front[layers.triangle]
+    single = torch.cat([single, (plain[world.owner[face]] & closed & front).nonzero()[:, 0]]).sort().values
+    if len(found.front) == 0:
+        return found, single
+    kept = (found.front < 0) | ~plain[world.owner[face[found.front.clamp(min=0)]]]
+    return Intervals(*(x[kept] for x in found)), single
 
 
 def nearest(candidates: Candidates, depth: Float[Tensor, "n"]) -> Int[Tensor, "m"]:
