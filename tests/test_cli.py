@@ -72,6 +72,17 @@ def test_render_and_compare(small, tmp_path):
     assert "PSNR inf dB" in run("compare", tmp_path / "a.exr", tmp_path / "a.exr").stdout
 
 
+def test_render_frames(small, tmp_path):
+    result = run("render", small, "--frames", "2", "--path", "light", "--out", tmp_path / "a.png", "--backend", "torch")
+    assert result.stdout.split() == [str(tmp_path / "a_0001.png"), str(tmp_path / "a_0002.png")]
+    assert "exists already" in run("render", small, "--frames", "2", "--out", tmp_path / "a.png").stderr
+    assert run("render", small, "--frames", "2", "--out", tmp_path / "a.gif").exit_code == 0
+    for wrong in (("--frames", "2", "--out", tmp_path / "a.exr"), ("--frames", "0", "--out", tmp_path / "b.gif")):
+        result = run("render", small, *wrong)
+        assert result.exit_code == 2
+        assert not (tmp_path / "b.gif").exists()
+
+
 def test_bake_every_material(small, tmp_path):
     content = yaml.safe_load(small.read_text())
     del content["materials"]["unused"]

@@ -154,12 +154,34 @@ def compress(table: str, method: str, rank: int, storage: Any, silhouette: str |
 @main.command()
 @click.argument("configuration")
 @click.option("--silhouette", type=click.Choice(["none", "paper", "curved"]), help="Overrides the configuration.")
-@click.option("--out", required=True, help="Picture: .png (sRGB) or .exr (linear, with depth).")
+@click.option("--backend", type=click.Choice(["auto", "torch", "opencl"]), help="Overrides the configuration [auto].")
+@click.option("--frames", type=int, help="Frames of one whole turn, to .png (a sequence), .gif or .mp4.")
+@click.option(
+    "--path",
+    "way",
+    type=click.Choice(["turntable", "light"]),
+    default="turntable",
+    show_default=True,
+    help="With --frames, what turns: the camera around the subject, or the lights.",
+)
+@click.option("--fps", default=25.0, show_default=True, help="Frames per second of .gif and .mp4.")
+@click.option("--out", required=True, help="Picture: .png (sRGB) or .exr (linear, with depth); film: .gif, .mp4.")
 @click.option("--truth", is_flag=True, help="Ray-trace the displaced mesh instead: the ground truth.")
 @click.option("--force", is_flag=True, help="Replace an existing picture.")
 @click.option("--json", "as_json", is_flag=True, help="Print counts and times as JSON.")
-def render(configuration: str, silhouette: Any, out: str, truth: bool, force: bool, as_json: bool) -> None:
-    """Render CONFIGURATION (.yaml); bakes what is not in the cache."""
+def render(
+    configuration: str,
+    silhouette: Any,
+    backend: Any,
+    frames: int | None,
+    way: Any,
+    fps: float,
+    out: str,
+    truth: bool,
+    force: bool,
+    as_json: bool,
+) -> None:
+    """Render CONFIGURATION (.yaml), one picture or many frames; bakes what is not in the cache."""
     from torchmeso import config
     from torchmeso.data import image
     from torchmeso.pipeline import render as job
@@ -167,11 +189,16 @@ def render(configuration: str, silhouette: Any, out: str, truth: bool, force: bo
     from torchmeso.render import film
 
     settings = config.load(configuration)
+    if silhouette is not None:
+        settings = config.with_silhouette(settings, silhouette)
+    if backend is not None:
+        settings = settings.model_copy(update={"backend": backend})
+    if frames is not None:
+        _render_frames(settings, out, truth, force, {"frames": frames, "way": way, "fps": fps})
+        return
     if not out.lower().endswith((".png", ".exr")):
         raise ConfigError(f"{out}: expected a name that ends in .png or .exr")
     _refuse_to_replace(out, force)
-    if silhouette is not None:
-        settings = config.with_silhouette(settings, silhouette)
     with _progress() as report:
         if truth:
             found = truths.render(settings, report)
@@ -185,6 +212,22 @@ def render(configuration: str, silhouette: Any, out: str, truth: bool, force: bo
             film.write(picture, out)
             about = {"path": out, "counts": picture.counts, "seconds": picture.seconds}
     click.echo(json.dumps(about) if as_json else out)
+
+
+def _render_frames(settings: Any, out: str, truth: bool, force: bool, options: dict[str, Any]) -> None:
+    from torchmeso.data import video
+    from torchmeso.pipeline import animate
+
+    if truth:
+        raise ConfigError("render: --truth makes one picture; leave --frames out")
+    if not out.lower().endswith(video.SUFFIXES):
+        raise ConfigError(f"{out}: expected a name that ends in {', '.join(video.SUFFIXES)}")
+    for path in video.paths(out, options["frames"]):
+        _refuse_to_replace(path, force)
+    with _progress() as report:
+        written = animate.render(settings, out, report=report, **options)
+    for path in written:
+        click.echo(path)
 
 
 @main.command()

@@ -18,6 +18,7 @@ import torch
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator, validate_call
 
+from torchmeso.backends import BackendChoice
 from torchmeso.compress.eigen import EigenOptions
 from torchmeso.data import height_field
 from torchmeso.errors import ConfigError, FormatError, MesoError, did_you_mean
@@ -306,6 +307,7 @@ class Config(_Strict):
     ambient_rule: Literal["add", "paper"] = "add"
     background: Vector = (0.0, 0.0, 0.0)
     camera: CameraConfig
+    backend: BackendChoice = "auto"
     render: FrameOptions = Field(default_factory=FrameOptions)
     truth: TruthConfig = Field(default_factory=TruthConfig)
 

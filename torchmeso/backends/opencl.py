@@ -27,6 +27,7 @@ from torchmeso.errors import BackendError, human_size
 
 if TYPE_CHECKING:
     import pyopencl as cl
+    from pyopencl import Buffer as Buffer
 
 # Pinning PoCL's threads removes a bimodal 1x / 2x in kernels of about a millisecond; read at the first OpenCL call.
 os.environ.setdefault("POCL_AFFINITY", "1")

@@ -19,10 +19,10 @@ from torchmeso.errors import FormatError
 from torchmeso.pipeline import report as reports
 from torchmeso.pipeline import truth as truths
 from torchmeso.pipeline.bake import Report, silent
-from torchmeso.pipeline.render import render
+from torchmeso.pipeline.render import Painter, render
 from torchmeso.pipeline.report import Figure, Page
 from torchmeso.pipeline.scene import bare
-from torchmeso.render import film, frame
+from torchmeso.render import film
 from torchmeso.render.scene import Scene
 
 
@@ -55,7 +55,8 @@ def run(config: Config, out: str | Path, report: Report = silent) -> list[Path]:
         seconds |= {f"{name}: {step}": s for step, s in asset.seconds.items()}
     picture = made.picture
     seconds |= {f"frame: {step}": s for step, s in picture.seconds.items()}
-    plain = frame.render(bare(made.scene), config.camera.build(), replace(config.render, silhouette="none"))
+    options = replace(config.render, silhouette="none")
+    plain = Painter(bare(made.scene), options, config.backend).paint(config.camera.build())
     before = time.perf_counter()
     truth = truths.render(config, report)
     seconds["truth (0 s when cached)"] = time.perf_counter() - before

@@ -7,7 +7,7 @@ Kernels: kernels_cl/render/silhouette.clh, kernels_cl/data/*.clh          Test: 
 """
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -25,9 +25,6 @@ from torchmeso.geometry.hemisphere import DirectionSet
 from torchmeso.geometry.light import DirectionalLight, Light, SpotLight
 from torchmeso.render.rasterize import DeviceMesh, upload_mesh
 from torchmeso.render.scene import Material, Scene, World
-
-if TYPE_CHECKING:
-    import pyopencl as cl
 
 BLOCK, GROUP = 64, 4
 """Bytes that tables are aligned to, and components that stand in one vector."""
@@ -74,11 +71,11 @@ class DeviceScene(NamedTuple):
     """
 
     mesh: DeviceMesh
-    records: "cl.Buffer"
-    facets: "cl.Buffer"
-    tables: "cl.Buffer"
-    mdfs: "cl.Buffer"
-    reflectances: "cl.Buffer"
+    records: "opencl.Buffer"
+    facets: "opencl.Buffer"
+    tables: "opencl.Buffer"
+    mdfs: "opencl.Buffer"
+    reflectances: "opencl.Buffer"
     textured: bool
     nbytes: int
 

@@ -14,7 +14,7 @@ Test: tests/render/test_rasterize.py (against a brute-force A-buffer in float64)
 """
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -25,9 +25,6 @@ from torchmeso.backends import opencl
 from torchmeso.geometry import clip
 from torchmeso.geometry.camera import Camera
 from torchmeso.geometry.clip import Polygons
-
-if TYPE_CHECKING:
-    import pyopencl as cl
 
 SUBPIXELS = 256
 """Sub-pixel positions per pixel and axis."""
@@ -304,9 +301,9 @@ class DeviceMesh(NamedTuple):
         n_face: F.
     """
 
-    vertices: "cl.Buffer"
-    faces: "cl.Buffer"
-    tags: "cl.Buffer"
+    vertices: "opencl.Buffer"
+    faces: "opencl.Buffer"
+    tags: "opencl.Buffer"
     boxes: Float[np.ndarray, "object 8 3"]
     bodies: Bool[np.ndarray, "object"]
     n_vertex: int

@@ -10,7 +10,6 @@ Kernels: kernels_cl/render/renderer.cl, kernels_cl/render/shadow_map.cl         
 
 import time
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -26,9 +25,6 @@ from torchmeso.render.film import Picture
 from torchmeso.render.frame import MEMORY_LIMIT, FrameOptions
 from torchmeso.render.rasterize import ROOM, STAMPS, TILE, DeviceViews
 from torchmeso.render.scene import Scene, assemble
-
-if TYPE_CHECKING:
-    import pyopencl as cl
 
 MAX_LIGHTS = 64
 """Of a frame, as in kernels_cl/render/shadow_map.clh."""
@@ -64,7 +60,7 @@ class Renderer:
         self._defines = (f"-DSILHOUETTE={mode}",)
         self._workers = opencl.units()
         self._extra, self._cut_room, self._light_room = 4096, 0, 1
-        self._lists: tuple[cl.Buffer, cl.Buffer] | None = None
+        self._lists: tuple[opencl.Buffer, opencl.Buffer] | None = None
         self._picture: _Picture | None = None
         self._maps: _Maps | None = None
         self.counts: dict[str, int] = {}
@@ -166,7 +162,7 @@ class Renderer:
         self._lists = self._picture = self._maps = None
         return False
 
-    def _layers(self) -> "tuple[cl.Buffer, cl.Buffer]":
+    def _layers(self) -> "tuple[opencl.Buffer, opencl.Buffer]":
         """Return where the tiles at work keep their layers."""
         if self._lists is None:
             capacity = self._taken + self._extra
@@ -278,7 +274,7 @@ class _Maps:
     """Shadow maps of all lights on the device."""
 
     views: DeviceViews
-    texels: "cl.Buffer"
+    texels: "opencl.Buffer"
     draw: list[opencl.Call]
     sizes: tuple[tuple[int, int], ...]
     lights: tuple[Light, ...] = ()
@@ -291,7 +287,7 @@ class _Picture:
 
     key: tuple
     views: DeviceViews
-    results: "list[tuple[cl.Buffer, Tensor]]"
+    results: "list[tuple[opencl.Buffer, Tensor]]"
     lights: opencl.Shared
     frame: opencl.Shared
     empty: opencl.Shared

@@ -1,0 +1,66 @@
+import numpy as np
+import pytest
+from PIL import Image
+
+from torchmeso.data import video
+from torchmeso.errors import ConfigError
+
+COLOURS = ((255, 0, 0), (0, 255, 0), (0, 0, 255))
+
+
+def record(path, fps=10.0):
+    with video.record(path, fps=fps, count=len(COLOURS)) as reel:
+        for colour in COLOURS:
+            reel.add(np.full((33, 50, 3), colour, np.uint8))
+
+
+def test_a_sequence_of_pictures(tmp_path):
+    record(tmp_path / "walk.png")
+    names = [tmp_path / f"walk_{i:04d}.png" for i in (1, 2, 3)]
+    assert video.paths(tmp_path / "walk.png", 3) == names
+    assert sorted(tmp_path.iterdir()) == names
+    for name, colour in zip(names, COLOURS, strict=True):
+        with Image.open(name) as picture:
+            assert picture.getpixel((20, 20)) == colour
+
+
+def test_a_gif_that_repeats(tmp_path):
+    record(tmp_path / "walk.gif")
+    with Image.open(tmp_path / "walk.gif") as film:
+        assert (film.n_frames, film.info["duration"], film.info["loop"]) == (3, 100, 0)
+        for i, colour in enumerate(COLOURS):
+            film.seek(i)
+            assert film.convert("RGB").getpixel((20, 20)) == colour
+
+
+def test_mp4(tmp_path):
+    cv2 = pytest.importorskip("cv2", reason="the extra `video` is not installed")
+    record(tmp_path / "walk.mp4")
+    assert [p.name for p in tmp_path.iterdir()] == ["walk.mp4"]
+    reader = cv2.VideoCapture(str(tmp_path / "walk.mp4"))
+    for colour in COLOURS:
+        there, frame = reader.read()
+        assert there
+        assert frame.shape == (32, 50, 3)
+        assert np.abs(frame[16, 25, ::-1].astype(int) - colour).max() < 40
+    assert not reader.read()[0]
+
+
+@pytest.mark.parametrize("suffix", ["gif", "mp4"])
+def test_nothing_is_left_of_a_film_that_was_stopped(suffix, tmp_path):
+    if suffix == "mp4":
+        pytest.importorskip("cv2", reason="the extra `video` is not installed")
+    with pytest.raises(KeyboardInterrupt), video.record(tmp_path / f"a.{suffix}", fps=10, count=2) as reel:
+        reel.add(np.zeros((32, 32, 3), np.uint8))
+        raise KeyboardInterrupt
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_other_suffixes(tmp_path):
+    with pytest.raises(ConfigError, match=r"expected a name that ends in \.png, \.gif, \.mp4"):
+        record(tmp_path / "walk.avi")
+    with (
+        pytest.raises(ConfigError, match="expected at least one frame"),
+        video.record(tmp_path / "empty.gif", fps=10, count=0),
+    ):
+        pass

@@ -1,0 +1,81 @@
+"""Many frames of a configuration: around the subject, or with the lights going around it.
+
+Test: tests/pipeline/test_animate.py
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal
+
+import torch
+
+from torchmeso.config import Config, Vector
+from torchmeso.data import video
+from torchmeso.errors import check_range
+from torchmeso.geometry.camera import Camera
+from torchmeso.geometry.light import Light
+from torchmeso.pipeline import scene as scenes
+from torchmeso.pipeline.bake import Report, prepare, silent
+from torchmeso.pipeline.render import Painter
+
+Way = Literal["turntable", "light"]
+
+
+def render(
+    config: Config,
+    out: str | Path,
+    *,
+    frames: int,
+    way: Way = "turntable",
+    fps: float = 25.0,
+    report: Report = silent,
+) -> list[Path]:
+    """Render `frames` frames of one whole turn to `out` (.png sequence, .gif or .mp4) and return the files.
+
+    Raises:
+        MesoError: a file is missing or unreadable, or an option is out of range.
+    """
+    check_range("frames", frames, 1, 100_000)
+    check_range("fps", fps, 1, 1000)
+    painter = Painter(scenes.build(config, prepare(config, report)), config.render, config.backend)
+    with video.record(out, fps=fps, count=frames) as reel:
+        for i, (camera, lights) in enumerate(turn(config, frames, way)):
+            report("frames", i / frames)
+            reel.add(painter.show(camera, lights))
+    report("frames", 1)
+    return video.paths(out, frames)
+
+
+def turn(config: Config, frames: int, way: Way) -> Iterator[tuple[Camera, tuple[Light, ...]]]:
+    """Yield the cameras and lights of one turn around the camera's `at` and `up`; the first is the configuration's."""
+    for i in range(frames):
+        angle = 360.0 * i / frames
+        view, lights = config.camera, config.lights
+        if way == "turntable":
+            view = view.model_copy(update={"eye": _around(view.eye, view.at, view.up, angle)})
+        else:
+            # Directions turn around the origin, places around what the camera looks at.
+            lights = [
+                light.model_copy(
+                    update={
+                        name: _around(
+                            getattr(light, name), (0.0, 0.0, 0.0) if name == "direction" else view.at, view.up, angle
+                        )
+                        for name in ("direction", "position", "at")
+                        if hasattr(light, name)
+                    }
+                )
+                for light in lights
+            ]
+        yield view.build(), tuple(light.build() for light in lights)
+
+
+def _around(point: Vector, centre: Vector, axis: Vector, angle_deg: float) -> Vector:
+    """Return `point` turned around the line through `centre` along `axis`."""
+    p, c, k = (torch.tensor(x, dtype=torch.float64) for x in (point, centre, axis))
+    k = k / k.norm()
+    a = torch.tensor(angle_deg, dtype=torch.float64).deg2rad()
+    v = p - c
+    turned = v * a.cos() + torch.linalg.cross(k, v) * a.sin() + k * (k @ v) * (1 - a.cos())
+    x, y, z = (turned + c).tolist()
+    return x, y, z
