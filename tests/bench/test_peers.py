@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -41,3 +43,14 @@ def test_missing_peer_is_said(monkeypatch):
     monkeypatch.setitem(sys.modules, "open3d", None)
     with pytest.raises(PeerMissing, match="open3d"):
         peers.embree_first_hit(scenes.knot_view(), torch.zeros(3, 3), torch.zeros(1, 3, dtype=torch.long))
+
+
+def test_mitsuba_sees_the_same_pixels(knot):
+    """In a process of its own; what is lit is what the light's direction says."""
+    camera = replace(scenes.knot_view(), width=80, height=60)
+    try:
+        times = peers.mitsuba(knot.vertices, knot.faces, camera, torch.tensor([0.0, 0.0, 1.0]), n=2)
+    except PeerMissing as missing:
+        pytest.skip(str(missing))
+    assert len(times) == 2
+    assert min(times) > 0

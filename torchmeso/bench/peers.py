@@ -5,10 +5,16 @@ Extra `peers`: moderngl and open3d; llvmpipe also needs the Debian packages libe
 Test: tests/bench/test_peers.py
 """
 
+import ctypes.util
+import json
 import os
+import subprocess
+import sys
+import tempfile
 from collections.abc import Callable
 from functools import lru_cache
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -80,6 +86,58 @@ class Llvmpipe:
 
 class PeerMissing(Exception):
     """A peer is not installed; the text says what is missing."""
+
+
+class Embree:
+    """Camera rays, and shadow rays from where they hit, by open3d's RaycastingScene on both cores."""
+
+    def __init__(
+        self, vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], camera: Camera, light: Float[Tensor, "3"]
+    ):
+        """Build the scene and all rays; `light` is the direction towards it.
+
+        Raises:
+            PeerMissing: open3d does not load.
+        """
+        self.primary = embree_first_hit(camera, vertices, faces)
+        open3d: Any = import_module("open3d")
+        tensor = open3d.core.Tensor
+        self._scene = open3d.t.geometry.RaycastingScene()
+        self._scene.add_triangles(tensor(vertices.float().numpy()), tensor(faces.numpy().astype(np.uint32)))
+        t = self.primary()["t_hit"].numpy()
+        origin, direction, _ = camera.rays(camera.pixel_centres().reshape(-1, 2))
+        hit = np.isfinite(t)
+        place = origin.numpy()[hit] + t[hit, None] * direction.numpy()[hit] + 1e-3 * light.numpy()
+        self._shadow = tensor(np.concatenate([place, np.broadcast_to(light.numpy(), place.shape)], 1).astype("f4"))
+
+    def both(self) -> None:
+        """Cast the camera rays, then the shadow rays."""
+        self.primary()
+        self._scene.test_occlusions(self._shadow)
+
+
+def mitsuba(
+    vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], camera: Camera, light: Float[Tensor, "3"], *, n: int
+) -> list[float]:
+    """Return the milliseconds of `n` pictures by Mitsuba's llvm variant, in a process of its own.
+
+    Raises:
+        PeerMissing: Mitsuba or its LLVM is missing; the text says which.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        np.savez(
+            Path(folder) / "mesh.npz", vertices=vertices.numpy(), faces=faces.numpy(), eye=camera.eye.numpy(),
+            axes=camera.axes.numpy(), fov_deg=camera.fov_deg, direction=light.numpy(), width=camera.width,
+            height=camera.height, n=n,
+        )  # fmt: skip
+        command = [sys.executable, "-m", "torchmeso.bench.mitsuba_peer", folder]
+        llvm = ctypes.util.find_library("LLVM-19")  # older ones do not know this processor's instructions
+        environment = os.environ | ({"DRJIT_LIBLLVM_PATH": llvm} if llvm else {})
+        run = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
+    if run.returncode:
+        reason = run.stderr.strip().splitlines()[-1:] or ["no word"]
+        raise PeerMissing(f"Mitsuba ({reason[0]}); pip install 'torchmeso[mitsuba]' and the package libllvm19")
+    return json.loads(run.stdout.splitlines()[-1])["ms"]
 
 
 def embree_first_hit(camera: Camera, vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Callable[[], Any]:

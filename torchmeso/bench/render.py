@@ -14,7 +14,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from torchmeso import config, quality
-from torchmeso.bench import colour, peers, scenes
+from torchmeso.bench import colour, peers, scenes, speed
 from torchmeso.bench.peers import PeerMissing
 from torchmeso.bench.suite import Context, Measurement, Row
 from torchmeso.bench.timing import Timing, time_together
@@ -333,6 +333,8 @@ MEASUREMENTS = [
     Measurement("shadow", shadow),
     Measurement("btf", colour.btf),
     Measurement("mdf", mdf),
+    Measurement("frame", speed.frame),
+    Measurement("growth", speed.growth),
 ]
 """In the order they run."""
 

@@ -20,8 +20,14 @@ class Timing(NamedTuple):
     n: int
 
 
-def time_together(calls: dict[str, Callable[[], object]], *, n: int, warm: int = 2) -> dict[str, Timing]:
-    """Return the timing of each call, taken in turns so that all meet the same noise."""
+def time_together(
+    calls: dict[str, Callable[[], object]], *, n: int, warm: int = 2, settle: int = 0
+) -> dict[str, Timing]:
+    """Return the timing of each call, taken in turns so that all meet the same noise.
+
+    With `settle` each timed call follows that many untimed ones: what it costs again and again, not after the others
+    have taken the cache.
+    """
     for call in calls.values():
         for _ in range(warm):
             call()
@@ -29,6 +35,8 @@ def time_together(calls: dict[str, Callable[[], object]], *, n: int, warm: int =
     cpu: dict[str, list[float]] = {name: [] for name in calls}
     for _ in range(n):
         for name, call in calls.items():
+            for _ in range(settle):
+                call()
             before, start = time.process_time(), time.perf_counter()
             call()
             wall[name].append(1e3 * (time.perf_counter() - start))

@@ -42,8 +42,8 @@ FRAME = np.dtype(
 class Renderer:
     """Renders one scene on the device; cameras and lights may change from frame to frame."""
 
-    def __init__(self, scene: Scene, options: FrameOptions | None = None):
-        """Upload `scene`.
+    def __init__(self, scene: Scene, options: FrameOptions | None = None, *, one_layer: bool = False):
+        """Upload `scene`; with `one_layer` only the nearest fragment of a pixel is kept (a yardstick for benchmarks).
 
         Raises:
             BackendError: there is no device, or a material is of a kind that kernels do not read.
@@ -57,7 +57,8 @@ class Renderer:
         textured = self._device.textured or not self._skips.plain
         mode = {"none": 0, "paper": 1, "curved": 2}[self.options.silhouette] if textured else 0
         self._plain = mode == 0 and silhouettes
-        self._defines = (f"-DSILHOUETTE={mode}",)
+        self._defines = (f"-DSILHOUETTE={mode}", *(["-DONE_LAYER"] * one_layer))
+        self._cull = mode == 0 and self._skips.hidden
         self._workers = opencl.units()
         self._extra, self._cut_room, self._light_room = 4096, 0, 1
         self._lists: tuple[opencl.Buffer, opencl.Buffer] | None = None
@@ -228,8 +229,7 @@ class Renderer:
             picture.empty.send()
             picture.outputs = outputs
         # Where no surface has depth, what is turned away can hide nothing.
-        cull = self._skips.hidden and self._defines == ("-DSILHOUETTE=0",)
-        picture.views.aim([camera], taken=self._taken, frustum=self._skips.frustum, cull=cull)
+        picture.views.aim([camera], taken=self._taken, frustum=self._skips.frustum, cull=self._cull)
         picture.draw()
         return picture
 

@@ -1,0 +1,107 @@
+"""The suite `skip`: what each skip leaves out in each scene, and what that gains.
+
+Test: tests/bench/test_skips.py
+"""
+
+from collections.abc import Iterator
+from dataclasses import fields, replace
+from functools import partial
+
+import torch
+
+from torchmeso.bench import frames
+from torchmeso.bench.suite import Context, Measurement, Row
+from torchmeso.bench.timing import time_together
+from torchmeso.geometry import mesh
+from torchmeso.geometry.light import SpotLight
+from torchmeso.render.frame import FrameOptions, Skips
+from torchmeso.render.renderer import Renderer
+from torchmeso.render.scene import Material, Object, Scene
+
+COUNTERS = {
+    "frustum": "triangles beside the view",
+    "empty_tiles": "tiles that stayed empty",
+    "hidden": "triangles turned away",
+    "behind": "stretches behind a resolved pixel",
+    "bounds": "intervals passed by the facets alone",
+    "plain": "frames without silhouette code",
+    "losers": "pixels shaded for nothing",
+    "resting": "shadow maps kept",
+    "unlit": "lights left out",
+}
+"""What counts each skip; `losers` counts what is done without it."""
+
+
+def skip(context: Context) -> Iterator[Row]:
+    """Each skip off, beside all on, in four scenes."""
+    for name, (scene, timed) in _scenes(context).items():
+        camera = frames.camera_at(scene, timed, 0.5)
+        options = FrameOptions(silhouette="curved", shadow_map_size=768)
+        calls, renderers = {}, {}
+        for off in ("", *(f.name for f in fields(Skips))):
+            skips = replace(Skips(), **({off: False} if off else {}))
+            renderers[off] = Renderer(scene, replace(options, skips=skips))
+            calls[off] = partial(renderers[off].show, camera)
+        timing = time_together(calls, n=9 if context.quick else 25, warm=3, settle=1)
+        on = renderers[""].counts
+        for f in fields(Skips):
+            counter = COUNTERS[f.name]
+            count = on[counter] if f.name != "losers" else renderers[f.name].counts[counter]
+            yield Row(
+                id=f"skip.{f.name}.{name}",
+                what=f"time of a frame of {name} without the skip {f.name}, over the time with all; counted: {counter}",
+                value=round(timing[f.name].wall / timing[""].wall, 3), unit="x", better="higher", n=timing[""].n,
+                peer=f"{count} {counter}; {timing[f.name].wall:.2f} ms without, {timing[''].wall:.2f} ms with",
+                curve={"series": f.name, "x": name},
+            )  # fmt: skip
+    yield from _ranks(context)
+
+
+def _ranks(context: Context) -> Iterator[Row]:
+    """The one lossy skip: time and error over the error that is allowed."""
+    timed = frames.knot(rank=16)
+    scene = frames.build(timed, context.report)
+    camera = frames.camera_at(scene, timed, 0.5)
+    exact = Renderer(scene).render(camera).rgb.clone()
+    errors = (0.0, 0.05, 0.2)
+    drawn = {e: Renderer(scene, FrameOptions(shadow_map_size=768, rank_error=e)) for e in errors}
+    timing = time_together(
+        {str(e): lambda r=r: r.show(camera) for e, r in drawn.items()}, n=9 if context.quick else 25, warm=3, settle=1
+    )
+    for e, r in drawn.items():
+        picture = r.render(camera)
+        yield Row(
+            id=f"skip.rank_error.{e:g}",
+            what=f"time of a frame with 16 components, over one that spares groups which add at most {e:g} to T",
+            value=round(timing["0.0"].wall / timing[str(e)].wall, 3), unit="x", better="higher",
+            peer=f"{picture.counts['groups of components spared']} groups spared, largest error "
+            f"{float((picture.rgb - exact).abs().max()):.4f}",
+            curve={"series": "rank error", "x": e, "ms": round(timing[str(e)].wall, 2)},
+        )  # fmt: skip
+
+
+def _scenes(context: Context) -> dict[str, tuple[Scene, frames.Timed]]:
+    """The knot; the knot before a plain one, without any mesostructure; many objects, most beside the view; Fig. 13."""
+    timed = frames.knot()
+    knot = frames.build(timed, context.report)
+    body = knot.objects[0]
+    plain = replace(knot, objects=(Object(mesh=body.mesh, material=Material(btf=body.material.btf)),))
+    away = SpotLight(
+        position=torch.tensor([0.0, 9.0, 0.0]), axis=torch.tensor([0.0, 1.0, 0.0]), intensity=torch.full((3,), 80.0)
+    )
+    row = tuple(Object(mesh=_moved(body.mesh, 6.0 * i, -2.5 * i), material=body.material) for i in range(-2, 3))
+    crowd = replace(knot, objects=row, lights=(*knot.lights, away))
+    found = {"knot": (knot, timed), "plain": (plain, timed), "crowd": (crowd, timed)}
+    if not context.quick:
+        fig13 = dict(frames.table_2())["fig13"]
+        found["fig13"] = (frames.build(fig13, context.report), fig13)
+    return found
+
+
+def _moved(subject: mesh.Mesh, x: float, z: float) -> mesh.Mesh:
+    matrix = torch.eye(4)
+    matrix[0, 3], matrix[2, 3] = x, z
+    return mesh.transform(subject, matrix)
+
+
+MEASUREMENTS = [Measurement("skip", skip)]
