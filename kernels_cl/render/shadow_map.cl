@@ -15,6 +15,7 @@ static void block_stamp(const Place *place, const Rays *rays, __global const flo
     Ints next;
     next.vector = 0;
     const float size = (float)place->view->pixel_size;
+    const Floats dx = {rays->direction.x}, dy = {rays->direction.y}, dz = {rays->direction.z};
     int active = lanes, first_round = 1;
     while (active) {
         Stretches found;
@@ -27,43 +28,60 @@ static void block_stamp(const Place *place, const Rays *rays, __global const flo
         const int16 closed = found.back.vector >= 0;
         const Ints surface = {closed ? found.back.vector : found.front.vector};
         const float16 t = closed ? found.t_back.vector : found.t_front.vector;
-        const Surface s = surface_at(place, rays, hit, surface);
 #if SILHOUETTE != 0
-        const int thin = thin_lanes(place, rays, hit & ~found.single, &found, &s, 0, tally);
+        // First by the facets alone; what they leave open asks for the surface at the back.
+        int thin = thin_lanes(place, rays, hit & ~found.single, &found, 0, 0, tally);
         hit &= ~thin;
-#endif
-#if SILHOUETTE == 1
-        Floats reach;
-        if (thin) hit |= test_paper(place, rays, thin, &found, &s, 0, &reach, tally);
-#elif SILHOUETTE == 2
         if (thin) {
-            Floats at, reach;
-            at.vector = INFINITY;
-            int unmarched = 0, holes = 0;
-            hit |= test_curved(place, rays, thin, &found, &s, 0, &at, &unmarched, tally);
-            for (int rest = unmarched; rest; rest &= rest - 1) {
-                const int l = __builtin_ctz(rest);
-                if (place->mdfs[found.object.lane[l]].missing >= 0) holes |= 1 << l;
+            const Surface s = surface_at(place, rays, thin, found.back);
+            const int close = thin_lanes(place, rays, thin, &found, &s, 0, tally);
+            hit |= thin & ~close;
+            Floats reach;
+#if SILHOUETTE == 1
+            if (close) hit |= test_paper(place, rays, close, &found, &s, 0, &reach, tally);
+#else
+            if (close) {
+                Floats at;
+                at.vector = INFINITY;
+                int unmarched = 0, holes = 0;
+                hit |= test_curved(place, rays, close, &found, &s, 0, &at, &unmarched, tally);
+                for (int rest = unmarched; rest; rest &= rest - 1) {
+                    const int l = __builtin_ctz(rest);
+                    if (place->mdfs[found.object.lane[l]].missing >= 0) holes |= 1 << l;
+                }
+                if (holes) hit = (hit & ~holes) | test_paper(place, rays, holes, &found, &s, 0, &reach, tally);
             }
-            if (holes) hit = (hit & ~holes) | test_paper(place, rays, holes, &found, &s, 0, &reach, tally);
+#endif
         }
 #endif
         tally->carved += __builtin_popcount(candidates & ~found.inside & ~hit);
         if (!hit) continue;
-        const float16 cosine = -dot3(s.n, rays->direction);
-        const float16 lean = magnitude(cosine), steep = MAX(lean, (float16)STEEPEST);
+        Floats slope;  // cosine between the ray and the facet
+        slope.vector = 1.0f;
+        for (int rest = hit; rest; rest &= rest - 1) {
+            const int l = __builtin_ctz(rest);
+            __global const Facet *f = place->facets + place->slots[surface.lane[l]].face;
+            slope.lane[l] = f->normal[0] * dx.lane[l] + f->normal[1] * dy.lane[l] + f->normal[2] * dz.lane[l];
+        }
+        const float16 lean = magnitude(slope.vector), steep = MAX(lean, (float16)STEEPEST);
         const float16 texel = place->view->perspective ? size * t : (float16)size;
         const float16 bias = texel * (1.0f + SLOPE_BIAS * root(MAX(1.0f - steep * steep, (float16)0.0f)) / steep);
-        Floats slab;
-        slab.vector = 0.0f;
+        float16 base = bias;
 #if SILHOUETTE != 0
-        for (int rest = hit & ~to_bits(closed); rest; rest &= rest - 1) {
-            const int l = __builtin_ctz(rest);
-            __global const Mdf *mdf = place->mdfs + found.object.lane[l];
-            if (mdf->there && place->slots[surface.lane[l]].tag & FRONT) slab.lane[l] = mdf->h;
+        const int open = hit & ~to_bits(closed);
+        if (open) {
+            Floats slab;
+            slab.vector = 0.0f;
+            for (int rest = open; rest; rest &= rest - 1) {
+                const int l = __builtin_ctz(rest);
+                __global const Mdf *mdf = place->mdfs + found.object.lane[l];
+                if (mdf->there && place->slots[surface.lane[l]].tag & FRONT) slab.lane[l] = mdf->h;
+            }
+            const Surface s = surface_at(place, rays, open, surface);
+            const float16 cosine = -dot3(s.n, rays->direction);
+            base = s.scale * slab.vector / MAX(cosine, (float16)MIN_COS) + bias;
         }
 #endif
-        const float16 base = s.scale * slab.vector / MAX(cosine, (float16)MIN_COS) + bias;
         const float16 half_way = 0.5f * (t - found.t_front.vector);
         const float16 offset = closed ? -MIN(bias, half_way) : base;
         const int16 better = from_bits(hit) & (t + offset < start.vector);
@@ -111,6 +129,13 @@ static INNER void draw_light_tiles(const int worker, __global const View *restri
                 const Rays rays = stamp_rays(view, x, y);
                 block_stamp(&place, &rays, key + lists.begin[s], slot + lists.begin[s], filled, lanes, &nearest, &behind,
                             &tally);
+            }
+            if (x + 4 <= view->width && y + 4 <= view->height && view->width % 4 == 0) {
+                Texel row[16] __attribute__((aligned(64)));
+                for (int l = 0; l < 16; l++) row[l].slot = nearest.lane[l], row[l].behind = behind.lane[l];
+                for (int k = 0; k < 4; k++)
+                    *(__global int8 *)(texels + view->texels + (y + k) * view->width + x) = *(const int8 *)(row + 4 * k);
+                continue;
             }
             for (int rest = lanes; rest; rest &= rest - 1) {
                 const int l = __builtin_ctz(rest);

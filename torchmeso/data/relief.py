@@ -28,8 +28,8 @@ REFINEMENT = 4
 CODES = 65535
 """Depths are multiples of h / 65535: what kernels keep in 16 bits is then the same."""
 
-STEEPEST_STEPS, FINEST_STEPS, BISECTIONS = 16, 1024, 6
-"""A ray takes one relief texel per step, but at least 16 and at most 1024 steps through the slab, then bisects."""
+STEEPEST_STEPS, FINEST_STEPS = 16, 1024
+"""A ray takes one relief texel per step, but at least 16 and at most 1024 steps through the slab."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -70,22 +70,23 @@ class Relief:
         steps = (self.h * slope.norm(dim=-1) / texel).clamp(STEEPEST_STEPS, FINEST_STEPS)
         step = self.h / steps
 
-        def above(which: Tensor, z: Tensor) -> Tensor:
-            return self.depth(uv[which] - slope[which] * z.unsqueeze(-1)) > z
+        def clearance(which: Tensor, z: Tensor) -> Tensor:
+            return self.depth(uv[which] - slope[which] * z.unsqueeze(-1)) - z
 
         z = torch.full_like(cosine, torch.inf)
         active = torch.arange(len(uv))
         upper = torch.zeros_like(cosine)
-        active = active[above(active, upper)]
-        z[torch.ones_like(z, dtype=torch.bool).index_fill_(0, active, False)] = 0
-        upper = upper[active]
+        over = clearance(active, upper)
+        z[over <= 0] = 0
+        active = (over > 0).nonzero()[:, 0]
+        upper, over = upper[active], over[active]
         while len(active):
             lower = torch.minimum(upper + step[active], torch.full_like(upper, self.h))
-            free = above(active, lower)
-            met = (~free).nonzero()[:, 0]
-            z[active[met]] = _bisect(above, active[met], upper[met], lower[met])
-            on = (free & (lower < self.h)).nonzero()[:, 0]
-            active, upper = active[on], lower[on]
+            under = clearance(active, lower)
+            met = (under <= 0).nonzero()[:, 0]
+            z[active[met]] = _meeting(upper[met], over[met], lower[met], under[met])
+            on = ((under > 0) & (lower < self.h)).nonzero()[:, 0]
+            active, upper, over = active[on], lower[on], under[on]
         return z / cosine
 
 
@@ -149,10 +150,7 @@ def _refine_rows(z: Tensor, factor: int) -> Tensor:
     return torch.stack(rows, 1).reshape(factor * z.shape[0], *z.shape[1:])
 
 
-def _bisect(above, which: Tensor, upper: Tensor, lower: Tensor) -> Tensor:
-    """Return the depth between `upper` (free) and `lower` (inside) at which a ray enters the relief."""
-    for _ in range(BISECTIONS):
-        middle = (upper + lower) / 2
-        free = above(which, middle)
-        upper, lower = torch.where(free, middle, upper), torch.where(free, lower, middle)
-    return (upper + lower) / 2
+def _meeting(upper: Tensor, over: Tensor, lower: Tensor, under: Tensor) -> Tensor:
+    """Return where a line from `over` (above the relief) to `under` (not above it) meets it; half way out of a hole."""
+    share = torch.where(over.isinf(), 0.5, over / (over - under).clamp(min=1e-20))
+    return upper + (lower - upper) * share

@@ -24,7 +24,7 @@ from torch import Tensor
 from torchmeso.data.mdf import MIN_COS
 from torchmeso.geometry import frames
 from torchmeso.geometry.camera import Camera
-from torchmeso.geometry.directions import dot
+from torchmeso.geometry.directions import dot, normalize
 from torchmeso.geometry.light import DirectionalLight, Light, SpotLight
 from torchmeso.render.rasterize import Triangles, depth_at, rasterize
 from torchmeso.render.scene import Scene, World, interpolate, rays
@@ -96,8 +96,11 @@ def _draw(scene: Scene, world: World, camera: Camera, silhouette: Silhouette) ->
     closed = candidates.back >= 0
     surface = torch.where(closed, candidates.back, candidates.fragment)
     points = interpolate(world, layers, camera, surface)
-    cosine = dot(points.frame.n, -rays(camera, candidates.pixel)[1])
-    steep = cosine.abs().clamp(min=STEEPEST)
+    direction = rays(camera, candidates.pixel)[1]
+    cosine = dot(points.frame.n, -direction)
+    corner = world.vertices[world.faces[layers.triangles.face[layers.triangle[surface]]]]
+    facet = normalize(torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]))
+    steep = dot(facet, direction).abs().clamp(min=STEEPEST)
     t = layers.t[surface]
     texel = camera.pixel_size * (t if camera.projection == "perspective" else torch.ones_like(t))
     bias = texel * (1 + SLOPE_BIAS * (1 - steep.square()).clamp(min=0).sqrt() / steep)
