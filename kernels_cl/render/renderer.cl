@@ -190,11 +190,7 @@ static void draw_stamp(const Place *place, const Target *target, const Rays *ray
     }
     for (int rest = shaded; rest;) {
         const int object = seen->object.lane[__builtin_ctz(rest)];
-        int same = 0;
-        for (int b = rest; b; b &= b - 1) {
-            const int l = __builtin_ctz(b);
-            same |= seen->object.lane[l] == object ? 1 << l : 0;
-        }
+        const int same = rest & to_bits(seen->object.vector == object);
         shade_object(place, target->reflectances + object, lights, frame, rays, seen, same, blocked, colour, spared);
         rest &= ~same;
     }
@@ -277,19 +273,17 @@ static Seen look(const Place *place, const Rays *rays, __global const float16 *k
         while (asked) {
             const int object = found.object.lane[__builtin_ctz(asked)];
             __global const Mdf *mdf = place->mdfs + object;
-            int same = 0;
-            for (int rest = asked; rest; rest &= rest - 1) {
-                const int l = __builtin_ctz(rest);
-                same |= found.object.lane[l] == object ? 1 << l : 0;
-            }
+            const int same = asked & to_bits(found.object.vector == object);
             asked &= ~same;
             if (!mdf->there) continue;
-            tally->looked += __builtin_popcount(same);
-            float16 D = s.scale * mdf_distance(place->tables, mdf, same, s.u, s.v, wo);
+            const int deep = same & ~on_plateau(place->tables, mdf, same, s.u, s.v);
+            tally->looked += __builtin_popcount(deep);
+            if (!deep) continue;  // d is 0 already
+            float16 D = s.scale * mdf_distance(place->tables, mdf, deep, s.u, s.v, wo);
             // A ray without a hit ends at the bottom of an open surface's slab.
             const float16 lowest = s.scale * mdf->h / MAX(wo.z, (float16)MIN_COS);
             D = from_bits(found.single) & (D == INFINITY) ? lowest : D;
-            d = from_bits(same) ? D : d;
+            d = from_bits(deep) ? D : d;
         }
 #if SILHOUETTE == 2
         const int16 interval = ~from_bits(found.single) & (reach.vector < 0.0f);

@@ -88,6 +88,8 @@ static void block_stamp(const Place *place, const Rays *rays, __global const flo
         start.vector = better ? t + offset : start.vector;
         nearest->vector = better ? surface.vector : nearest->vector;
         behind->vector = better ? offset : behind->vector;
+        // Nothing begins within the interval: what comes later lies behind.
+        if (place->skips & SKIP_BEHIND) active &= ~(hit & to_bits(closed) & ~found.crowded);
     }
 }
 

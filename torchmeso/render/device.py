@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int, UInt8, UInt16
 from torch import Tensor
 
 from torchmeso.backends import opencl
@@ -45,7 +45,7 @@ REFLECTANCE = np.dtype(
 MDF = np.dtype(
     [(name, "i4") for name in ("there", "height", "width", "rings", "ring_count", "delta", "missing")]
     + [(name, "i4") for name in ("relief_height", "relief_width", "relief", "hole")]
-    + [("h", "f4"), ("delta_max", "f4"), ("pad", "i4", 3)]
+    + [("h", "f4"), ("delta_max", "f4"), ("plateau", "i4"), ("pad", "i4", 2)]
 )
 
 LIGHT = np.dtype(
@@ -219,9 +219,19 @@ def _mdf(pool: "_Pool", mdf: object) -> np.ndarray:
     record["relief_height"], record["relief_width"] = relief.drop.shape
     codes = (relief.drop / relief.h * RELIEF_CODES).round().numpy().astype(np.uint16)
     record["relief"] = pool.add(np.concatenate([codes, codes[:, :1]], 1))
+    record["plateau"] = pool.add(_plateaus(codes, (mdf.delta == 0).all(0).numpy()))
     record["hole"] = -1 if relief.hole is None else pool.add(relief.hole.float().numpy())
     record["h"], record["delta_max"] = mdf.h, mdf.delta_max
     return record
+
+
+def _plateaus(codes: UInt16[np.ndarray, "H4 W4"], top: Bool[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W"]:
+    """Return whether a texel and two all around it lie at the reference plane, in the relief and in every view."""
+    height, width = top.shape
+    flat = top & (codes.reshape(height, codes.shape[0] // height, width, -1) == 0).all((1, 3))
+    for axis in (0, 1):
+        flat = np.stack([np.roll(flat, k, axis) for k in range(-2, 3)]).all(0)
+    return flat.astype(np.uint8)
 
 
 def _rings(directions: DirectionSet) -> Float[np.ndarray, "ring 8"]:
