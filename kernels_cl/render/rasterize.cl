@@ -30,6 +30,7 @@ __kernel void set_up(__global const View *restrict views, __global const Project
                      __global const int *restrict faces,   // (F, 3)
                      __global const int2 *restrict tags,   // (F) component << 2 | CLOSED, object
                      __global Triangle *restrict triangles, __global Slot *restrict slots,
+                     __global Label *restrict labels,
                      __global int *restrict boxes,         // (4, slots) per view: low x, low y, -high x, -high y
                      __global int *restrict coarse,        // (4, slots / 16)
                      __global uchar *restrict crossing,    // (padded faces) per view
@@ -70,13 +71,13 @@ __kernel void set_up(__global const View *restrict views, __global const Project
                 double4 planes[3];
                 const int made = set_up_triangle(view, x, y, q, hidden, &front, triangles + s, planes, box);
                 if (made > 0) {
-                    keep_planes(slots + s, planes, box);
+                    keep_planes(slots + s, labels + s, planes, box);
                     drawn++;
                 }
                 turned += made < 0;
-                slots[s].face = f;
-                slots[s].tag = tags[f].x | (front ? FRONT : 0);
-                slots[s].object = tags[f].y;
+                labels[s].face = f;
+                labels[s].tag = tags[f].x | (front ? FRONT : 0);
+                labels[s].object = tags[f].y;
             }
         }
         crossing[get_global_id(1) * padded + f] = crosses;
@@ -135,7 +136,8 @@ static int cut(Corner *corner, const int count, const int plane, const double ne
 // always the same.
 __kernel void cut_faces(__global const View *restrict views, __global const double *restrict vertices,
                         __global const int *restrict faces, __global const int2 *restrict tags,
-                        __global Triangle *restrict triangles, __global Slot *restrict slots, __global int *restrict boxes, __global int *restrict coarse,
+                        __global Triangle *restrict triangles, __global Slot *restrict slots,
+                        __global Label *restrict labels, __global int *restrict boxes, __global int *restrict coarse,
                         __global const uchar *restrict crossing, __global Counters *restrict counters,
                         __global const int *restrict objects, const int count, const int padded, const int stride,
                         const int n_object)
@@ -181,12 +183,12 @@ __kernel void cut_faces(__global const View *restrict views, __global const doub
                             for (int j = 0; j < 3; j++) whole[j] += part[c] * corner[fan[c]].share[j];
                         planes[r] = (double4)(whole[0], whole[1], whole[2], planes[r].w);
                     }
-                    keep_planes(slots + s, planes, box);
+                    keep_planes(slots + s, labels + s, planes, box);
                     counted->drawn++;
                 }
-                slots[s].face = f;
-                slots[s].tag = tags[f].x | (front ? FRONT : 0);
-                slots[s].object = tags[f].y;
+                labels[s].face = f;
+                labels[s].tag = tags[f].x | (front ? FRONT : 0);
+                labels[s].object = tags[f].y;
                 for (int b = 0; b < 4; b++) box_of[b * stride + padded + n] = box[b];
             }
         }

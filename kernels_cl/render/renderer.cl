@@ -266,7 +266,7 @@ static Seen look(const Place *place, const Rays *rays, __global const float16 *k
         int fronts = 0;
         for (int rest = asked & found.single; rest; rest &= rest - 1) {
             const int l = __builtin_ctz(rest);
-            if (place->slots[found.front.lane[l]].tag & FRONT) fronts |= 1 << l;
+            if (place->labels[found.front.lane[l]].tag & FRONT) fronts |= 1 << l;
         }
         asked = (asked & ~found.single) | fronts;
         d = reach.vector >= 0.0f ? reach.vector : 0.0f;
@@ -348,13 +348,13 @@ static void clear_stamp(__global const Frame *frame, const int plane, const int 
 }
 
 static INNER void draw_tiles(const int worker, __global const View *restrict view,
-                             __global const Triangle *restrict triangles, __global const Slot *restrict slots,
+                             __global const Triangle *restrict triangles, __global const Slot *restrict slots, __global const Label *restrict labels,
                              __global const int16 *restrict boxes, __global const int16 *restrict coarse,
                              __global Counters *restrict counters, __global const int *restrict faces,
                              __global const float16 *restrict records, __global const Facet *restrict facets,
                              __global const uchar *restrict tables, __global const Mdf *restrict mdfs,
                              __global const Reflectance *restrict reflectances, __global const Light *restrict lights,
-                             __global const View *restrict light_views, __global const Slot *restrict light_slots,
+                             __global const View *restrict light_views, __global const Slot *restrict light_slots, __global const Label *restrict light_labels,
                              __global const Triangle *restrict light_triangles, __global const Texel *restrict texels,
                              __global const Frame *restrict frame, __global float16 *restrict key,
                              __global int16 *restrict slot, __global uchar4 *restrict shown,
@@ -362,8 +362,8 @@ static INNER void draw_tiles(const int worker, __global const View *restrict vie
                              __global int *restrict owner, __global uchar *restrict shadowed,
                              __global int *restrict empty)
 {
-    const Place place = {view, slots, faces, records, facets, tables, mdfs, !view->outside, 1, frame->skips};
-    const Target target = {frame,  reflectances, lights, {light_views, light_slots, light_triangles, texels},
+    const Place place = {view, slots, labels, faces, records, facets, tables, mdfs, !view->outside, 1, frame->skips};
+    const Target target = {frame,  reflectances, lights, {light_views, light_slots, light_labels, light_triangles, texels},
                            shown, rgba,         depth,  owner, shadowed};
     const int across = (view->width + TILE - 1) / TILE, down = (view->height + TILE - 1) / TILE;
     Lists lists;
@@ -414,13 +414,13 @@ static INNER void draw_tiles(const int worker, __global const View *restrict vie
 
 __kernel __attribute__((reqd_work_group_size(1, 1, 1)))
 void draw(__global const View *restrict view, __global const Triangle *restrict triangles,
-          __global const Slot *restrict slots,
+          __global const Slot *restrict slots, __global const Label *restrict labels,
           __global const int16 *restrict boxes, __global const int16 *restrict coarse,
           __global Counters *restrict counters, __global const int *restrict faces,
           __global const float16 *restrict records, __global const Facet *restrict facets,
           __global const uchar *restrict tables, __global const Mdf *restrict mdfs,
           __global const Reflectance *restrict reflectances, __global const Light *restrict lights,
-          __global const View *restrict light_views, __global const Slot *restrict light_slots,
+          __global const View *restrict light_views, __global const Slot *restrict light_slots, __global const Label *restrict light_labels,
           __global const Triangle *restrict light_triangles, __global const Texel *restrict texels,
           __global const Frame *restrict frame,
           __global float16 *restrict key, __global int16 *restrict slot,  // layers of the tiles at work
@@ -431,7 +431,7 @@ void draw(__global const View *restrict view, __global const Triangle *restrict 
           __global uchar *restrict shadowed,   // (light, H, pitch)
           __global int *restrict empty)        // (tiles) whether a tile already shows the background
 {
-    draw_tiles(get_group_id(0), view, triangles, slots, boxes, coarse, counters, faces, records, facets, tables, mdfs,
-               reflectances, lights, light_views, light_slots, light_triangles, texels, frame, key, slot, shown, rgba,
+    draw_tiles(get_group_id(0), view, triangles, slots, labels, boxes, coarse, counters, faces, records, facets, tables, mdfs,
+               reflectances, lights, light_views, light_slots, light_labels, light_triangles, texels, frame, key, slot, shown, rgba,
                depth, owner, shadowed, empty);
 }

@@ -60,7 +60,7 @@ static void block_stamp(const Place *place, const Rays *rays, __global const flo
         slope.vector = 1.0f;
         for (int rest = hit; rest; rest &= rest - 1) {
             const int l = __builtin_ctz(rest);
-            __global const Facet *f = place->facets + place->slots[surface.lane[l]].face;
+            __global const Facet *f = place->facets + place->labels[surface.lane[l]].face;
             slope.lane[l] = f->normal[0] * dx.lane[l] + f->normal[1] * dy.lane[l] + f->normal[2] * dz.lane[l];
         }
         const float16 lean = magnitude(slope.vector), steep = MAX(lean, (float16)STEEPEST);
@@ -75,7 +75,7 @@ static void block_stamp(const Place *place, const Rays *rays, __global const flo
             for (int rest = open; rest; rest &= rest - 1) {
                 const int l = __builtin_ctz(rest);
                 __global const Mdf *mdf = place->mdfs + found.object.lane[l];
-                if (mdf->there && place->slots[surface.lane[l]].tag & FRONT) slab.lane[l] = mdf->h;
+                if (mdf->there && place->labels[surface.lane[l]].tag & FRONT) slab.lane[l] = mdf->h;
             }
             const Surface s = surface_at(place, rays, open, surface);
             const float16 cosine = -dot3(s.n, rays->direction);
@@ -94,7 +94,7 @@ static void block_stamp(const Place *place, const Rays *rays, __global const flo
 }
 
 static INNER void draw_light_tiles(const int worker, __global const View *restrict views,
-                                   __global const Triangle *restrict triangles, __global const Slot *restrict slots,
+                                   __global const Triangle *restrict triangles, __global const Slot *restrict slots, __global const Label *restrict labels,
                                    __global const int16 *restrict boxes, __global const int16 *restrict coarse,
                                    __global Counters *restrict counters, __global const int *restrict faces,
                                    __global const float16 *restrict records, __global const Facet *restrict facets,
@@ -106,7 +106,7 @@ static INNER void draw_light_tiles(const int worker, __global const View *restri
     __global const View *view = views + number;
     __global Counters *counted = counters + number;
     const int coarse_stride = ((stride >> 4) + 15) >> 4;
-    const Place place = {view, slots + view->slots, faces, records, facets, tables, mdfs,
+    const Place place = {view, slots + view->slots, labels + view->slots, faces, records, facets, tables, mdfs,
                          !view->outside, 0, skips};
     const int across = (view->width + TILE - 1) / TILE, down = (view->height + TILE - 1) / TILE;
     Lists lists;
@@ -151,7 +151,7 @@ static INNER void draw_light_tiles(const int worker, __global const View *restri
 
 __kernel __attribute__((reqd_work_group_size(1, 1, 1)))
 void draw_light(__global const View *restrict views, __global const Triangle *restrict triangles,
-                __global const Slot *restrict slots,
+                __global const Slot *restrict slots, __global const Label *restrict labels,
                 __global const int16 *restrict boxes, __global const int16 *restrict coarse,
                 __global Counters *restrict counters, __global const int *restrict faces,
                 __global const float16 *restrict records, __global const Facet *restrict facets,
@@ -160,6 +160,6 @@ void draw_light(__global const View *restrict views, __global const Triangle *re
                 __global float16 *restrict key, __global int16 *restrict slot,  // layers of the tiles at work
                 __global Texel *restrict texels)
 {
-    draw_light_tiles(get_group_id(0), views, triangles, slots, boxes, coarse, counters, faces, records, facets,
+    draw_light_tiles(get_group_id(0), views, triangles, slots, labels, boxes, coarse, counters, faces, records, facets,
                      tables, mdfs, number, stride, capacity, skips, key, slot, texels);
 }

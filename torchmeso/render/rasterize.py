@@ -36,7 +36,7 @@ GUARD_BAND = 16384.0
 TILE, STAMPS, ROOM = 64, 256, 4
 """Side of a tile in pixels, its stamps, and the layers a stamp begins with, in kernels_cl/render/rasterize.clh."""
 
-TRIANGLE_BYTES, SLOT_BYTES, PROJECTED_BYTES, LIMIT = 96, 64, 24, 1 << 30
+TRIANGLE_BYTES, SLOT_BYTES, LABEL_BYTES, PROJECTED_BYTES, LIMIT = 96, 48, 16, 24, 1 << 30
 """Sizes of the kernels' structures, and what no box reaches."""
 
 VIEW = np.dtype(
@@ -382,11 +382,12 @@ class DeviceViews:
         self.projected = opencl.allocate(count * mesh.n_vertex * PROJECTED_BYTES)
         self.triangles = opencl.allocate(count * self.stride * TRIANGLE_BYTES)
         self.slots = opencl.allocate(count * self.stride * SLOT_BYTES)
+        self.labels = opencl.allocate(count * self.stride * LABEL_BYTES)
         self.boxes = opencl.upload(np.full(count * self.stride * 4, LIMIT, np.int32))
         self.coarse = opencl.upload(np.full(count * vectors * 4, LIMIT, np.int32))
         crossing = opencl.allocate(count * self.padded)
         sizes = (np.int32(mesh.n_face), np.int32(self.padded), np.int32(self.stride), np.int32(len(mesh.boxes)))
-        screen = (self.triangles, self.slots, self.boxes, self.coarse, crossing, self.counters, self._beside.buffer)
+        screen = (self.triangles, self.slots, self.labels, self.boxes, self.coarse, crossing, self.counters, self._beside.buffer)
         path = "render/rasterize.cl"
         self.steps = {
             "vertices": opencl.Call(
@@ -489,7 +490,7 @@ class DeviceRaster:
         begin, layers = (opencl.fetch(x, np.zeros(across * down, np.int32)) for x in (self._begin, self._layers))
         key = opencl.fetch(self._key, np.zeros((self._capacity, 16), np.float32))
         slot = opencl.fetch(self._slot, np.zeros((self._capacity, 16), np.int32))
-        faces = opencl.fetch(self.views.slots, np.zeros((self.views.stride, SLOT_BYTES // 4), np.int32))[:, 12]
+        faces = opencl.fetch(self.views.labels, np.zeros((self.views.stride, LABEL_BYTES // 4), np.int32))[:, 2]
         stamp = np.repeat(np.arange(across * down), layers)
         layer = np.arange(len(stamp)) - np.repeat(np.cumsum(layers) - layers, layers)
         key, slot = key[begin[stamp] + layer], slot[begin[stamp] + layer]

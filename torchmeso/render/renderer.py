@@ -195,7 +195,7 @@ class Renderer:
         draw = [
             opencl.Call(
                 "render/shadow_map.cl", "draw_light", (self._workers,), (1,),
-                (views.views, views.triangles, views.slots, views.boxes, views.coarse, views.counters,
+                (views.views, views.triangles, views.slots, views.labels, views.boxes, views.coarse, views.counters,
                  scene.mesh.faces, scene.records, scene.facets, scene.tables, scene.mdfs, np.int32(number),
                  np.int32(views.stride), capacity, np.int32(self._skip_bits()), *self._layers(), texels),
                 self._defines,
@@ -252,13 +252,13 @@ class Renderer:
         frame, empty = opencl.Shared(np.zeros(1, FRAME)), opencl.Shared(np.zeros(tiles, np.int32))
         scene, light = self._device, self._maps
         shadows = (
-            (light.views.views, light.views.slots, light.views.triangles, light.texels)
+            (light.views.views, light.views.slots, light.views.labels, light.views.triangles, light.texels)
             if light
-            else (views.views, views.slots, views.triangles, views.slots)
+            else (views.views, views.slots, views.labels, views.triangles, views.slots)
         )
         draw = opencl.Call(
             "render/renderer.cl", "draw", (self._workers,), (1,),
-            (views.views, views.triangles, views.slots, views.boxes, views.coarse, views.counters,
+            (views.views, views.triangles, views.slots, views.labels, views.boxes, views.coarse, views.counters,
              scene.mesh.faces, scene.records, scene.facets, scene.tables, scene.mdfs, scene.reflectances,
              lights.buffer, *shadows, frame.buffer, *self._layers(), *(b for b, _ in results), empty.buffer),
             self._defines,
