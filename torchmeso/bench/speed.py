@@ -20,6 +20,8 @@ from torchmeso.bench import frames, peers
 from torchmeso.bench.peers import PeerMissing
 from torchmeso.bench.suite import Context, Row
 from torchmeso.bench.timing import Timing, time_together
+from torchmeso.data.eigen_btf import EigenBtf
+from torchmeso.data.mdf import Mdf
 from torchmeso.geometry import shapes
 from torchmeso.geometry.camera import Camera
 from torchmeso.geometry.light import DirectionalLight
@@ -236,8 +238,8 @@ def growth(context: Context) -> Iterator[Row]:
         draw = Renderer(subject, FrameOptions(shadow_map_size=MAP, skips=Skips(resting=False), **options))
         t = time_together({"frame": lambda: draw.show(view)}, n=n, warm=3)["frame"]
         return Row(
-            id=f"growth.{series}.{x:g}", what=f"frame of the knot, curved, shadows; {series}: {x:g}", value=round(t.wall, 2),
-            unit="ms", better="lower", spread=(round(t.low, 2), round(t.high, 2)), n=n,
+            id=f"growth.{series}.{x:g}", what=f"frame of the knot, curved, shadows; {series}: {x:g}",
+            value=round(t.wall, 2), unit="ms", better="lower", spread=(round(t.low, 2), round(t.high, 2)), n=n,
             curve={"series": series, "x": x, "ms": round(t.wall, 2)},
         )  # fmt: skip
 
@@ -258,7 +260,20 @@ def growth(context: Context) -> Iterator[Row]:
     for layers in (1, 2, 4, 8):
         body = shapes.sphere(triangles=2000)
         nested = tuple(Object(mesh=_scaled(body, 1 - 0.08 * i), material=material) for i in range(layers))
-        yield row("nested bodies", layers, Scene(objects=nested, lights=lights), frames.knot().config.camera.build())
+        yield row("nested_bodies", layers, Scene(objects=nested, lights=lights), frames.knot().config.camera.build())
+    for factor in (1, 2, 4):
+        yield row("texels", 64 * factor, replace(scene, objects=(_finer(scene.objects[0], factor),)), camera)
+
+
+def _finer(subject: Object, factor: int) -> Object:
+    """Return an object with `factor` times the texels along a side: each one repeated."""
+    btf, mdf = subject.material.btf, subject.material.mdf
+    assert isinstance(btf, EigenBtf)
+    assert isinstance(mdf, Mdf)
+    maps = btf.maps.repeat_interleave(factor, 1).repeat_interleave(factor, 2)
+    delta = mdf.delta.repeat_interleave(factor, 1).repeat_interleave(factor, 2)
+    material = Material(btf=replace(btf, maps=maps), mdf=replace(mdf, delta=delta))
+    return Object(mesh=subject.mesh, material=material)
 
 
 def _turned(direction: torch.Tensor, share: float) -> torch.Tensor:

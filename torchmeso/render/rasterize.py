@@ -387,7 +387,16 @@ class DeviceViews:
         self.coarse = opencl.upload(np.full(count * vectors * 4, LIMIT, np.int32))
         crossing = opencl.allocate(count * self.padded)
         sizes = (np.int32(mesh.n_face), np.int32(self.padded), np.int32(self.stride), np.int32(len(mesh.boxes)))
-        screen = (self.triangles, self.slots, self.labels, self.boxes, self.coarse, crossing, self.counters, self._beside.buffer)
+        screen = (
+            self.triangles,
+            self.slots,
+            self.labels,
+            self.boxes,
+            self.coarse,
+            crossing,
+            self.counters,
+            self._beside.buffer,
+        )
         path = "render/rasterize.cl"
         self.steps = {
             "vertices": opencl.Call(
