@@ -130,10 +130,14 @@ class MesoConfig(BaseModel):
 
 
 class MaterialConfig(_Strict):
-    """A mesostructure with how to bake and compress it; or a finished model; or a plain colour."""
+    """A mesostructure with how to bake and compress it; or a finished model; or a plain colour.
+
+    `rank` reads only that many components of a model; the others stay on disk.
+    """
 
     meso: MesoConfig | None = None
     model: str | None = None
+    rank: int | None = Field(default=None, ge=1)
     albedo: Rgb | None = None
     btf: BtfOptions = Field(default_factory=BtfOptions)
     mdf: MdfOptions = Field(default_factory=MdfOptions)
@@ -143,6 +147,8 @@ class MaterialConfig(_Strict):
     def _check(self) -> "MaterialConfig":
         if sum(x is not None for x in (self.meso, self.model, self.albedo)) != 1:
             raise ValueError("expected exactly one of 'meso', 'model' (a .meso file) and 'albedo' (a plain colour)")
+        if self.rank is not None and self.model is None:
+            raise ValueError("'rank' belongs to a 'model'; a 'meso' has 'eigen: {rank: ...}'")
         return self
 
 

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from tests.pipeline.small import small
+from torchmeso.data import store
 from torchmeso.errors import ConfigError, FormatError
 from torchmeso.pipeline import bake
 
@@ -85,3 +86,30 @@ def test_refusals(tmp_path):
         bake.bake_tables("clay", small().materials["clay"], bake.silent, {})
     with pytest.raises(FormatError, match="expected a file, found none"):
         bake.file_hash(tmp_path / "none")
+
+
+def test_what_is_not_asked_for_stays_on_disk(tmp_path, monkeypatch):
+    """Without silhouettes no MDF is read; of eight components only as many as `rank` says."""
+    material = small().materials["brick"]
+    bake.prepare_material("brick", material)
+    read = []
+    original = store.Model.read
+    monkeypatch.setattr(store.Model, "read", lambda self, name: read.append(name) or original(self, name))
+    path = bake.model_path(material)
+    assert bake.open_model(path, depth=False, rank=1).mdf is None
+    assert [name for name in read if name.startswith(("mdf", "eigen.map"))] == ["eigen.map.0"]
+    read.clear()
+    bake.prepare(small(render={"silhouette": "none"}))
+    assert not any(name.startswith("mdf") for name in read)
+    read.clear()
+    bake.prepare(small())
+    assert {"mdf.delta", "eigen.map.0", "eigen.map.1"} <= set(read)
+
+
+def test_the_rank_of_a_model(tmp_path):
+    model = bake.model_path(small().materials["brick"])
+    bake.prepare(small())
+    content = {"materials": {"brick": {"model": str(model), "rank": 1}, "clay": {"albedo": [0.5, 0.5, 0.5]}}}
+    assert bake.prepare(small(**content))["brick"].material.btf.rank == 1
+    with pytest.raises(ConfigError, match="'rank' belongs to a 'model'"):
+        small(materials={"brick": {"albedo": [1, 1, 1], "rank": 1}, "clay": {"albedo": [0.5, 0.5, 0.5]}})

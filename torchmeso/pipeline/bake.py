@@ -55,15 +55,18 @@ def prepare(config: Config, report: Report = silent) -> dict[str, Asset]:
         MesoError: a file is missing, or an option is out of range.
     """
     used = {item.material for item in config.objects}
-    return {name: prepare_material(name, m, report) for name, m in config.materials.items() if name in used}
+    depth = config.render.silhouette != "none"
+    return {
+        name: prepare_material(name, m, report, depth=depth) for name, m in config.materials.items() if name in used
+    }
 
 
-def prepare_material(name: str, material: MaterialConfig, report: Report = silent) -> Asset:
-    """Return one material, baked and compressed or from the cache."""
+def prepare_material(name: str, material: MaterialConfig, report: Report = silent, *, depth: bool = True) -> Asset:
+    """Return one material, baked and compressed or from the cache; without `depth` its MDF stays on disk."""
     if material.albedo is not None:
         return Asset(material=Material(albedo=material.albedo), seconds={}, raw_bytes=0, model_bytes=0)
     if material.model is not None:
-        opened = open_model(material.model)
+        opened = open_model(material.model, depth=depth, rank=material.rank)
         return Asset(material=opened, seconds={}, raw_bytes=0, model_bytes=Path(material.model).stat().st_size)
     assert material.meso is not None
     seconds: dict[str, float] = {}
@@ -75,7 +78,8 @@ def prepare_material(name: str, material: MaterialConfig, report: Report = silen
         seconds["compress"] = time.perf_counter() - start
         eigen_btf.save(fitted, model, silhouette=mdf.load(mdf_table))
     raw = sum(_size_on_disk(p) for p in table_paths(material))
-    return Asset(material=open_model(model), seconds=seconds, raw_bytes=raw, model_bytes=model.stat().st_size)
+    opened = open_model(model, depth=depth)
+    return Asset(material=opened, seconds=seconds, raw_bytes=raw, model_bytes=model.stat().st_size)
 
 
 def bake_tables(
@@ -121,13 +125,18 @@ def bake_tables(
     return paths
 
 
-def open_model(path: str | Path) -> Material:
-    """Return the material in a run-time model (.meso).
+def open_model(path: str | Path, *, depth: bool = True, rank: int | None = None) -> Material:
+    """Return the material in a run-time model (.meso), reading what is asked for only.
+
+    Args:
+        path: the model.
+        depth: whether to read the MDF.
+        rank: components of the eigen BTF to read; all of them where it is None.
 
     Raises:
         FormatError: the file is missing, damaged, or holds no eigen BTF.
     """
-    return Material(btf=eigen_btf.load(path), mdf=mdf.from_model(store.Model(path)))
+    return Material(btf=eigen_btf.load(path, rank=rank), mdf=mdf.from_model(store.Model(path)) if depth else None)
 
 
 def table_paths(material: MaterialConfig) -> tuple[Path, Path]:

@@ -230,7 +230,7 @@ def _plateaus(codes: UInt16[np.ndarray, "H4 W4"], top: Bool[np.ndarray, "H W"]) 
     height, width = top.shape
     flat = top & (codes.reshape(height, codes.shape[0] // height, width, -1) == 0).all((1, 3))
     for axis in (0, 1):
-        flat = np.stack([np.roll(flat, k, axis) for k in range(-2, 3)]).all(0)
+        flat = np.logical_and.reduce([np.roll(flat, k, axis) for k in range(-2, 3)])
     return flat.astype(np.uint8)
 
 
