@@ -230,26 +230,13 @@ static Seen look(const Place *place, const Rays *rays, __global const float16 *k
         int hit = candidates;
         const float16 length = found.t_back.vector - found.t_front.vector;
         const Surface s = surface_at(place, rays, candidates & ~found.inside, found.front);
-        Floats reach;  // d_f; negative: to be asked
-        reach.vector = -1.0f;
 #if SILHOUETTE != 0
+        Floats reach, at;
+        reach.vector = -1.0f;
+        at.vector = INFINITY;
         const int thin = thin_lanes(place, rays, candidates & ~found.inside & ~found.single, &found, &s, 1, tally);
         hit &= ~thin;
-#endif
-#if SILHOUETTE == 1
-        if (thin) hit |= test_paper(place, rays, thin, &found, &s, 1, &reach, tally);
-#elif SILHOUETTE == 2
-        Floats at;
-        at.vector = INFINITY;
-        if (thin) {
-            int unmarched = 0, holes = 0;
-            hit |= test_curved(place, rays, thin, &found, &s, 1, &at, &unmarched, tally);
-            for (int rest = unmarched; rest; rest &= rest - 1) {
-                const int l = __builtin_ctz(rest);
-                if (place->mdfs[found.object.lane[l]].missing >= 0) holes |= 1 << l;
-            }
-            if (holes) hit = (hit & ~holes) | test_paper(place, rays, holes, &found, &s, 1, &reach, tally);
-        }
+        if (thin) hit |= test_silhouette(place, rays, thin, &found, &s, 1, &at, &reach, tally);
 #endif
         tally->carved += __builtin_popcount(candidates & ~hit);
         tally->inside += __builtin_popcount(hit & found.inside);

@@ -36,22 +36,9 @@ static void block_stamp(const Place *place, const Rays *rays, __global const flo
             const Surface s = surface_at(place, rays, thin, found.back);
             const int close = thin_lanes(place, rays, thin, &found, &s, 0, tally);
             hit |= thin & ~close;
-            Floats reach;
-#if SILHOUETTE == 1
-            if (close) hit |= test_paper(place, rays, close, &found, &s, 0, &reach, tally);
-#else
-            if (close) {
-                Floats at;
-                at.vector = INFINITY;
-                int unmarched = 0, holes = 0;
-                hit |= test_curved(place, rays, close, &found, &s, 0, &at, &unmarched, tally);
-                for (int rest = unmarched; rest; rest &= rest - 1) {
-                    const int l = __builtin_ctz(rest);
-                    if (place->mdfs[found.object.lane[l]].missing >= 0) holes |= 1 << l;
-                }
-                if (holes) hit = (hit & ~holes) | test_paper(place, rays, holes, &found, &s, 0, &reach, tally);
-            }
-#endif
+            Floats at, reach;
+            at.vector = INFINITY;
+            if (close) hit |= test_silhouette(place, rays, close, &found, &s, 0, &at, &reach, tally);
         }
 #endif
         tally->carved += __builtin_popcount(candidates & ~found.inside & ~hit);
