@@ -304,7 +304,7 @@ static Seen look(const Place *place, const Rays *rays, __global const float16 *k
         if (!(place->skips & SKIP_LOSERS)) {
             const Seen all = {s, position, found.object, {depth}, hit, found.inside & hit};
             draw_stamp(place, target, rays, &all, spared);
-            tally->losers += __builtin_popcount(hit);
+            tally->shaded += __builtin_popcount(hit);
         }
         // Nothing begins within the interval: what comes later lies behind.
         const int resolved = hit & ~found.crowded & ~found.single;
@@ -392,6 +392,7 @@ static INNER void draw_tiles(const int worker, __global const View *restrict vie
             const Seen seen = look(&place, &rays, key_of, slot + lists.begin[s], filled, lanes, &target, &spared,
                                    &tally);
             draw_stamp(&place, &target, &rays, &seen, &spared);
+            tally.shaded += __builtin_popcount(seen.seen);
         }
     }
     count_up(counters, &tally);

@@ -48,7 +48,7 @@ VIEW = np.dtype(
 COUNTERS = (
     "used", "vectors", "slots", "tile", "crossing", "behind", "degenerate", "drawn", "fragments",
     "deepest", "covered", "intervals", "deep", "carved", "inside", "hidden", "looked", "spared", "empty_tiles",
-    "beside", "turned", "losers", "bounded",
+    "beside", "turned", "shaded", "bounded",
 )  # fmt: skip
 """What the kernels count, in the order of `Counters` in kernels_cl/render/rasterize.clh; padded to 32."""
 

@@ -342,5 +342,5 @@ def _named(counts: dict[str, int], camera: Camera) -> dict[str, int]:
         "groups of components spared": counts["spared"],
         "triangles beside the view": counts["beside"],
         "triangles turned away": counts["turned"],
-        "pixels shaded for nothing": max(counts["losers"] - counts["covered"], 0),
+        "fragments not shaded": counts["fragments"] - counts["shaded"],
     }
