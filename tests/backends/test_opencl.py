@@ -1,5 +1,6 @@
 import warnings
 
+import numpy as np
 import pytest
 import torch
 
@@ -82,3 +83,35 @@ def test_build_failure_carries_the_log(device, tmp_path, monkeypatch):
         warnings.simplefilter("ignore")
         with pytest.raises(BackendError, match=r"(?s)kernels_cl/broken\.cl did not build:.*nonsense"):
             opencl.kernel("broken.cl", "broken")
+
+
+def test_a_file_is_composed_of_what_it_includes_once():
+    source = opencl.compose("render/renderer.cl")
+    assert "#include" not in source
+    assert source.count("static float16 atan2_(") == 1
+    assert source.index("static Taps bilinear(") < source.index("static float16 mdf_distance(")
+
+
+def test_kernels_build_where_the_compiler_knows_no_attributes(device, monkeypatch):
+    monkeypatch.setattr(opencl, "WIDE", ("no such thing;\n", "\n"))
+    monkeypatch.setattr(opencl, "_has_avx512", lambda: True)
+    assert opencl._program.__wrapped__("backends/opencl.cl", ()) is not None
+
+
+def test_what_the_host_shares(device):
+    shared = opencl.Shared(np.arange(5, dtype=np.float32))
+    assert shared.array.ctypes.data % 64 == 0
+    shared.array[2] = 7
+    shared.send()
+    assert shared.receive().tolist() == [0, 1, 7, 3, 4]
+    assert opencl.fetch(opencl.upload(np.arange(3)), np.zeros(3, int)).tolist() == [0, 1, 2]
+
+
+def test_a_call_keeps_its_time(device):
+    x, y = torch.ones(64, 16), torch.zeros(64, 16)
+    call = opencl.Call("backends/opencl.cl", "self_test", (64,), (8,), [opencl.buffer(x), opencl.buffer(y)])
+    assert call.milliseconds == 0
+    call()
+    opencl.read([])
+    assert call.milliseconds > 0
+    assert (y == 3).all()

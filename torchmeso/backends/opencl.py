@@ -172,14 +172,18 @@ def compose(path: str) -> str:
 @cache
 def _program(path: str, options: tuple[str, ...]) -> "cl.Program":
     cl = _pyopencl()
-    source = WIDE[0] + compose(path) + WIDE[1] if _has_avx512() else compose(path)
-    program = cl.Program(queue().context, source)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", cl.CompilerWarning)  # the compiler's remarks are ours, not the user's
-            return program.build(["-cl-std=CL1.2", *options])
-    except cl.Error as error:
-        raise BackendError(f"kernels_cl/{path} did not build:\n{error}") from error
+    source = compose(path)
+    failure: Exception | None = None
+    # A compiler that does not know the attributes builds for what it knows.
+    for text in (WIDE[0] + source + WIDE[1], source) if _has_avx512() else (source,):
+        program = cl.Program(queue().context, text)
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", cl.CompilerWarning)  # the compiler's remarks are ours, not the user's
+                return program.build(["-cl-std=CL1.2", *options])
+        except cl.Error as error:
+            failure = error
+    raise BackendError(f"kernels_cl/{path} did not build:\n{failure}") from failure
 
 
 @cache

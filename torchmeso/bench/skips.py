@@ -51,7 +51,8 @@ def skip(context: Context) -> Iterator[Row]:
                 id=f"skip.{f.name}.{name}",
                 what=f"time of a frame of {name} without the skip {f.name}, over the time with all; counted: {counter}",
                 value=round(timing[f.name].wall / timing[""].wall, 3), unit="x", better="higher", n=timing[""].n,
-                peer=f"{on[counter]} {counter}, {gone} without it; {timing[f.name].wall:.2f} ms without, {timing[''].wall:.2f} ms with",
+                peer=f"{on[counter]} {counter}, {gone} without it; "
+                f"{timing[f.name].wall:.2f} ms without, {timing[''].wall:.2f} ms with",
                 curve={"series": f.name, "x": name},
             )  # fmt: skip
     yield from _ranks(context)
