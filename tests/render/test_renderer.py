@@ -147,6 +147,19 @@ def test_frame_after_frame(still_life, device):
         assert torch.equal(mine.rgb, fresh.rgb)
 
 
+@pytest.mark.parametrize("silhouette", ["none", "curved"])
+def test_more_layers_than_there_was_room_for(silhouette, brick, device):
+    """Six bodies one in the other: eye and light both ask for more room, and draw again."""
+    body = shapes.sphere(triangles=300)
+    sizes = [torch.diag(torch.tensor([s, s, s, 1.0])) for s in (1.0, 0.9, 0.8, 0.7, 0.6, 0.5)]
+    objects = tuple(Object(mesh=mesh.transform(body, m), material=brick) for m in sizes)
+    scene = Scene(objects=objects, lights=LIGHTS["sun"])
+    options = FrameOptions(silhouette=silhouette, shadow_map_size=256)
+    exact, fast, wrong = compare(scene, camera((1.5, 1.0, 2.5), size=128), options)
+    assert wrong <= 4
+    assert torch.equal(exact.owner, fast.owner)
+
+
 def test_shadow_maps_rest_while_the_light_does(still_life, device):
     renderer = Renderer(Scene(objects=still_life, lights=LIGHTS["sun"]), FrameOptions(shadow_map_size=128))
     renderer.render(camera((1.5, 2.0, 3.5)))

@@ -190,7 +190,8 @@ class Renderer:
 
     def _make_maps(self, sizes: tuple[tuple[int, int], ...]) -> "_Maps":
         views = DeviceViews(self._device.mesh, len(sizes), cut_room=self._cut_room)
-        texels = opencl.allocate(8 * sum(w * h for w, h in sizes))
+        # Empty from the start: where layers find no room a tile stays as it was, and the frame is drawn again.
+        texels = opencl.upload(np.full((sum(w * h for w, h in sizes), 2), -1, np.int32))
         scene, capacity = self._device, np.int32(self._taken + self._extra)
         draw = [
             opencl.Call(
