@@ -58,14 +58,10 @@ static void shade_object(const Place *place, __global const Reflectance *reflect
     const Vector3 towards = {-rays->direction.x, -rays->direction.y, -rays->direction.z};
     const Vector3 wo = to_local(&seen->at, towards);
     const float4 albedo = {reflectance->albedo[0], reflectance->albedo[1], reflectance->albedo[2], 0.0f};
-    Footprint view;
-    Taps taps;
-    if (reflectance->there) {
-        view = footprint(TABLE(Ring, tables, reflectance->view_rings), reflectance->view_count, wo);
-        taps = bilinear(seen->at.u, seen->at.v, reflectance->height, reflectance->width);
-    }
     LookUp look_up;
     if (reflectance->there) {
+        const Footprint view = footprint(TABLE(Ring, tables, reflectance->view_rings), reflectance->view_count, wo);
+        const Taps taps = bilinear(seen->at.u, seen->at.v, reflectance->height, reflectance->width);
         for (int k = 0; k < 4; k++) {
             look_up.view_node[k].vector = view.node[k];
             look_up.view_share[k].vector = view.weight[k];
@@ -223,8 +219,8 @@ static Seen look(const Place *place, const Rays *rays, __global const float16 *k
     int active = lanes, first_round = 1, first_seen = 1;
     while (active) {
         Stretches found;
-        const int candidates = next_stretches(place, rays, key, slot, filled, &active, &next, &seen.depth, first_round, &found,
-                                              tally);
+        const int candidates = next_stretches(place, rays, key, slot, filled, &active, &next, &seen.depth, first_round,
+                                              &found, tally);
         first_round = 0;
         if (!candidates) break;
         int hit = candidates;
@@ -281,13 +277,24 @@ static Seen look(const Place *place, const Rays *rays, __global const float16 *k
         const float16 depth = found.t_front.vector + d;
         const int16 better = from_bits(hit) & (depth < seen.depth.vector);
         const int bits = to_bits(better);
+        const float16 t = found.t_front.vector;
+        const Vector3 position = {rays->origin.x + t * rays->direction.x, rays->origin.y + t * rays->direction.y,
+                                  rays->origin.z + t * rays->direction.z};
+        // What loses, now or to what was found now, is not shaded.
+        const int replaced = seen.seen & bits, beaten = hit & ~bits;
+        if (place->skips & SKIP_LOSERS) {
+            tally->losers += __builtin_popcount(replaced) + __builtin_popcount(beaten);
+        } else {
+            Seen loser = seen;
+            loser.seen = replaced;
+            if (replaced) draw_stamp(place, target, rays, &loser, spared);
+            const Seen other = {s, position, found.object, {depth}, beaten, found.inside & beaten};
+            if (beaten) draw_stamp(place, target, rays, &other, spared);
+        }
         seen.seen |= bits;
         seen.inside = (seen.inside & ~bits) | (found.inside & bits);
         seen.depth.vector = better ? depth : seen.depth.vector;
         seen.object.vector = better ? found.object.vector : seen.object.vector;
-        const float16 t = found.t_front.vector;
-        const Vector3 position = {rays->origin.x + t * rays->direction.x, rays->origin.y + t * rays->direction.y,
-                                  rays->origin.z + t * rays->direction.z};
         if (first_seen) {
             seen.at = s;
             seen.position = position;
@@ -300,11 +307,6 @@ static Seen look(const Place *place, const Rays *rays, __global const float16 *k
             seen.position.x = better ? position.x : seen.position.x;
             seen.position.y = better ? position.y : seen.position.y;
             seen.position.z = better ? position.z : seen.position.z;
-        }
-        if (!(place->skips & SKIP_LOSERS)) {
-            const Seen all = {s, position, found.object, {depth}, hit, found.inside & hit};
-            draw_stamp(place, target, rays, &all, spared);
-            tally->shaded += __builtin_popcount(hit);
         }
         // Nothing begins within the interval: what comes later lies behind.
         const int resolved = hit & ~found.crowded & ~found.single;
@@ -335,13 +337,15 @@ static void clear_stamp(__global const Frame *frame, const int plane, const int 
 }
 
 static INNER void draw_tiles(const int worker, __global const View *restrict view,
-                             __global const Triangle *restrict triangles, __global const Slot *restrict slots, __global const Label *restrict labels,
+                             __global const Triangle *restrict triangles, __global const Slot *restrict slots,
+                             __global const Label *restrict labels,
                              __global const int16 *restrict boxes, __global const int16 *restrict coarse,
                              __global Counters *restrict counters, __global const int *restrict faces,
                              __global const float16 *restrict records, __global const Facet *restrict facets,
                              __global const uchar *restrict tables, __global const Mdf *restrict mdfs,
                              __global const Reflectance *restrict reflectances, __global const Light *restrict lights,
-                             __global const View *restrict light_views, __global const Slot *restrict light_slots, __global const Label *restrict light_labels,
+                             __global const View *restrict light_views, __global const Slot *restrict light_slots,
+                             __global const Label *restrict light_labels,
                              __global const Triangle *restrict light_triangles, __global const Texel *restrict texels,
                              __global const Frame *restrict frame, __global float16 *restrict key,
                              __global int16 *restrict slot, __global uchar4 *restrict shown,
@@ -350,8 +354,8 @@ static INNER void draw_tiles(const int worker, __global const View *restrict vie
                              __global int *restrict empty)
 {
     const Place place = {view, slots, labels, faces, records, facets, tables, mdfs, !view->outside, 1, frame->skips};
-    const Target target = {frame,  reflectances, lights, {light_views, light_slots, light_labels, light_triangles, texels},
-                           shown, rgba,         depth,  owner, shadowed};
+    const Shadows shadows = {light_views, light_slots, light_labels, light_triangles, texels};
+    const Target target = {frame, reflectances, lights, shadows, shown, rgba, depth, owner, shadowed};
     const int across = (view->width + TILE - 1) / TILE, down = (view->height + TILE - 1) / TILE;
     Lists lists;
     Tally tally = {0};
@@ -392,7 +396,6 @@ static INNER void draw_tiles(const int worker, __global const View *restrict vie
             const Seen seen = look(&place, &rays, key_of, slot + lists.begin[s], filled, lanes, &target, &spared,
                                    &tally);
             draw_stamp(&place, &target, &rays, &seen, &spared);
-            tally.shaded += __builtin_popcount(seen.seen);
         }
     }
     count_up(counters, &tally);
@@ -408,7 +411,8 @@ void draw(__global const View *restrict view, __global const Triangle *restrict 
           __global const float16 *restrict records, __global const Facet *restrict facets,
           __global const uchar *restrict tables, __global const Mdf *restrict mdfs,
           __global const Reflectance *restrict reflectances, __global const Light *restrict lights,
-          __global const View *restrict light_views, __global const Slot *restrict light_slots, __global const Label *restrict light_labels,
+          __global const View *restrict light_views, __global const Slot *restrict light_slots,
+          __global const Label *restrict light_labels,
           __global const Triangle *restrict light_triangles, __global const Texel *restrict texels,
           __global const Frame *restrict frame,
           __global float16 *restrict key, __global int16 *restrict slot,  // layers of the tiles at work
@@ -419,7 +423,7 @@ void draw(__global const View *restrict view, __global const Triangle *restrict 
           __global uchar *restrict shadowed,   // (light, H, pitch)
           __global int *restrict empty)        // (tiles) whether a tile already shows the background
 {
-    draw_tiles(get_group_id(0), view, triangles, slots, labels, boxes, coarse, counters, faces, records, facets, tables, mdfs,
-               reflectances, lights, light_views, light_slots, light_labels, light_triangles, texels, frame, key, slot, shown, rgba,
-               depth, owner, shadowed, empty);
+    draw_tiles(get_group_id(0), view, triangles, slots, labels, boxes, coarse, counters, faces, records, facets, tables,
+               mdfs, reflectances, lights, light_views, light_slots, light_labels, light_triangles, texels, frame, key,
+               slot, shown, rgba, depth, owner, shadowed, empty);
 }

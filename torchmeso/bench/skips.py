@@ -25,7 +25,7 @@ COUNTERS = {
     "behind": "stretches behind a resolved pixel",
     "bounds": "intervals passed by the facets alone",
     "plain": "frames without silhouette code",
-    "losers": "fragments not shaded",
+    "losers": "losing fragments not shaded",
     "resting": "shadow maps kept",
     "unlit": "lights left out",
 }

@@ -60,7 +60,6 @@ class DeviceScene(NamedTuple):
 
     Attributes:
         mesh: all meshes as one.
-        faces: (F, 3) corners, as `mesh.faces`.
         records: (V, 16) float32, see `RECORD`.
         facets: (F,) see `FACET`.
         tables: everything that is looked up.

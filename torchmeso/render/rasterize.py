@@ -48,7 +48,7 @@ VIEW = np.dtype(
 COUNTERS = (
     "used", "vectors", "slots", "tile", "crossing", "behind", "degenerate", "drawn", "fragments",
     "deepest", "covered", "intervals", "deep", "carved", "inside", "hidden", "looked", "spared", "empty_tiles",
-    "beside", "turned", "shaded", "bounded",
+    "beside", "turned", "losers", "bounded",
 )  # fmt: skip
 """What the kernels count, in the order of `Counters` in kernels_cl/render/rasterize.clh; padded to 32."""
 
@@ -311,7 +311,7 @@ class DeviceMesh(NamedTuple):
 
 
 class DeviceLists(NamedTuple):
-    """All fragments of a picture as kernels keep them: by stamps of 4 x 4 pixels, layer upon layer.
+    """All fragments of a picture, pixel by pixel, near to far; ties in depth are ordered by triangle.
 
     Attributes:
         pixel: (N,) row * width + column, ascending.

@@ -58,7 +58,7 @@ class Renderer:
         mode = {"none": 0, "paper": 1, "curved": 2}[self.options.silhouette] if textured else 0
         self._plain = mode == 0 and silhouettes
         self._defines = (f"-DSILHOUETTE={mode}", *(["-DONE_LAYER"] * one_layer))
-        self._cull = mode == 0 and self._skips.hidden
+        self._cull = mode == 0 and self._skips.hidden  # where no surface has depth, faces turned away hide nothing
         self._workers = opencl.units()
         self._extra, self._cut_room, self._light_room = 4096, 0, 1
         self._lists: tuple[opencl.Buffer, opencl.Buffer] | None = None
@@ -229,7 +229,6 @@ class Renderer:
             picture.empty.array[:] = 0
             picture.empty.send()
             picture.outputs = outputs
-        # Where no surface has depth, what is turned away can hide nothing.
         picture.views.aim([camera], taken=self._taken, frustum=self._skips.frustum, cull=self._cull)
         picture.draw()
         return picture
@@ -343,5 +342,5 @@ def _named(counts: dict[str, int], camera: Camera) -> dict[str, int]:
         "groups of components spared": counts["spared"],
         "triangles beside the view": counts["beside"],
         "triangles turned away": counts["turned"],
-        "fragments not shaded": counts["fragments"] - counts["shaded"],
+        "losing fragments not shaded": counts["losers"],
     }
