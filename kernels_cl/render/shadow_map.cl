@@ -15,7 +15,6 @@ static void block_stamp(const Place *place, const Rays *rays, __global const flo
     Ints next;
     next.vector = 0;
     const float size = (float)place->view->pixel_size;
-    const Floats dx = {rays->direction.x}, dy = {rays->direction.y}, dz = {rays->direction.z};
     int active = lanes, first_round = 1;
     while (active) {
         Stretches found;
@@ -43,14 +42,7 @@ static void block_stamp(const Place *place, const Rays *rays, __global const flo
 #endif
         tally->carved += __builtin_popcount(candidates & ~found.inside & ~hit);
         if (!hit) continue;
-        Floats slope;  // cosine between the ray and the facet
-        slope.vector = 1.0f;
-        for (int rest = hit; rest; rest &= rest - 1) {
-            const int l = __builtin_ctz(rest);
-            __global const Facet *f = place->facets + place->labels[surface.lane[l]].face;
-            slope.lane[l] = f->normal[0] * dx.lane[l] + f->normal[1] * dy.lane[l] + f->normal[2] * dz.lane[l];
-        }
-        const float16 lean = magnitude(slope.vector), steep = MAX(lean, (float16)STEEPEST);
+        const float16 lean = magnitude(meet(place, rays, hit, surface).slope), steep = MAX(lean, (float16)STEEPEST);
         const float16 texel = place->view->perspective ? size * t : (float16)size;
         const float16 bias = texel * (1.0f + SLOPE_BIAS * root(MAX(1.0f - steep * steep, (float16)0.0f)) / steep);
         float16 base = bias;
