@@ -25,7 +25,75 @@ __kernel void project(__global const View *restrict views, __global const double
     out[view->vertices + i] = r;
 }
 
-// Sets up sixteen faces for one view. `slots` triangles of a view stand together, cut ones behind the others.
+static INNER void set_up_part(const int part, const int number, __global const View *restrict views,
+                              __global const Projected *restrict projected, __global const int *restrict faces,
+                              __global const int2 *restrict tags, __global Triangle *restrict triangles,
+                              __global Slot *restrict slots, __global Label *restrict labels,
+                              __global int *restrict boxes, __global int *restrict coarse,
+                              __global uchar *restrict crossing, __global Counters *restrict counters,
+                              __global const int *restrict objects, const int count, const int padded,
+                              const int stride, const int n_object)
+{
+    __global const View *view = views + number;
+    __global const Projected *p = projected + view->vertices;
+    __global Counters *counted = counters + number;
+    const int coarse_stride = ((stride >> 4) + 15) & ~15;
+    __global int *box_of = boxes + 4 * view->slots;
+    __global int *coarse_of = coarse + number * 4 * coarse_stride;
+    __global const int *beside_of = objects + number * n_object;
+    int drawn = 0, degenerate = 0, turned = 0, aside = 0, crossed = 0, behind = 0;
+    for (int v = VECTORS * part; v < MIN(VECTORS * (part + 1), padded >> 4); v++) {
+        __global Label *label = labels + view->slots + 16 * v;
+        Corners corners = {0};
+        int whole = 0, hidden = 0, crosses = 0;
+        for (int lane = 0; lane < 16; lane++) {
+            const int f = 16 * v + lane, bit = 1 << lane;
+            if (f >= count) break;
+            int ahead = 0, safe = 0;
+            for (int k = 0; k < 3; k++) {
+                const Projected at = p[faces[3 * f + k]];
+                corners.x[k].lane[lane] = at.x;
+                corners.y[k].lane[lane] = at.y;
+                corners.q[k].lane[lane] = at.q;
+                ahead += at.state & AHEAD;
+                safe += at.state & SAFE;
+            }
+            const int2 tag = tags[f];
+            if (beside_of[tag.y]) aside++;
+            else if (safe == 3 * SAFE) whole |= bit;
+            else if (ahead) crosses |= bit;
+            else behind++;
+            if (view->cull && tag.x & CLOSED) hidden |= bit;
+            label[lane].face = f;
+            label[lane].tag = tag.x;
+            label[lane].object = tag.y;
+        }
+        Planes planes;
+        const int made = set_up_triangles(view, &corners, whole, hidden, triangles + view->slots + 16 * v, &planes);
+        keep_planes(slots + view->slots + 16 * v, label, made, &planes);
+        for (int rest = planes.front; rest; rest &= rest - 1) label[__builtin_ctz(rest)].tag |= FRONT;
+        *(__global uchar16 *)(crossing + number * padded + 16 * v) =
+            __builtin_convertvector(from_bits(crosses), uchar16);
+        for (int k = 0; k < 4; k++) {
+            *(__global int16 *)(box_of + k * stride + 16 * v) = planes.box[k].vector;
+            int least = LIMIT;
+            for (int lane = 0; lane < 16; lane++) least = MIN(least, planes.box[k].lane[lane]);
+            coarse_of[k * coarse_stride + v] = least;
+        }
+        drawn += __builtin_popcount(made);
+        degenerate += __builtin_popcount(whole & ~made & ~planes.turned);
+        turned += __builtin_popcount(planes.turned);
+        crossed += __builtin_popcount(crosses);
+    }
+    if (drawn) atomic_add(&counted->drawn, drawn);
+    if (degenerate) atomic_add(&counted->degenerate, degenerate);
+    if (turned) atomic_add(&counted->turned, turned);
+    if (aside) atomic_add(&counted->beside, aside);
+    if (crossed) atomic_add(&counted->crossing, crossed);
+    if (behind) atomic_add(&counted->behind, behind);
+}
+
+// Sets up 16 VECTORS faces for one view. `slots` triangles of a view stand together, cut ones behind the others.
 __kernel void set_up(__global const View *restrict views, __global const Projected *restrict projected,
                      __global const int *restrict faces,   // (F, 3)
                      __global const int2 *restrict tags,   // (F) component << 2 | CLOSED, object
@@ -38,61 +106,8 @@ __kernel void set_up(__global const View *restrict views, __global const Project
                      __global const int *restrict objects,  // (view, object) whether it lies beside the view
                      const int count, const int padded, const int stride, const int n_object)
 {
-    const int v = get_global_id(0);
-    if (16 * v >= padded) return;
-    __global const View *view = views + get_global_id(1);
-    __global const Projected *p = projected + view->vertices;
-    __global Counters *counted = counters + get_global_id(1);
-    const int coarse_stride = ((stride >> 4) + 15) & ~15;
-    __global int *box_of = boxes + 4 * view->slots;
-    __global int *coarse_of = coarse + get_global_id(1) * 4 * coarse_stride;
-    int around[4] = {LIMIT, LIMIT, LIMIT, LIMIT};
-    int behind = 0, cut = 0, drawn = 0, whole = 0, beside = 0, turned = 0;
-    for (int lane = 0; lane < 16; lane++) {
-        const int f = 16 * v + lane, s = view->slots + f;
-        int box[4] = {LIMIT, LIMIT, LIMIT, LIMIT}, crosses = 0;
-        if (f < count && objects[get_global_id(1) * n_object + tags[f].y]) {
-            beside++;
-        } else if (f < count) {
-            int x[3], y[3], ahead = 0, safe = 0, front = 0;
-            double q[3];
-            for (int k = 0; k < 3; k++) {
-                const Projected c = p[faces[3 * f + k]];
-                x[k] = c.x, y[k] = c.y, q[k] = c.q;
-                ahead += c.state & AHEAD;
-                safe += c.state & SAFE;
-            }
-            crosses = ahead > 0 && safe < 3 * SAFE;
-            behind += ahead == 0;
-            cut += crosses;
-            if (safe == 3 * SAFE) {
-                const int hidden = view->cull && (tags[f].x & CLOSED);
-                whole++;
-                double4 planes[3];
-                const int made = set_up_triangle(view, x, y, q, hidden, &front, triangles + s, planes, box);
-                if (made > 0) {
-                    keep_planes(slots + s, labels + s, planes, box);
-                    drawn++;
-                }
-                turned += made < 0;
-                labels[s].face = f;
-                labels[s].tag = tags[f].x | (front ? FRONT : 0);
-                labels[s].object = tags[f].y;
-            }
-        }
-        crossing[get_global_id(1) * padded + f] = crosses;
-        for (int k = 0; k < 4; k++) {
-            box_of[k * stride + f] = box[k];
-            around[k] = MIN(around[k], box[k]);
-        }
-    }
-    for (int k = 0; k < 4; k++) coarse_of[k * coarse_stride + v] = around[k];
-    if (drawn) atomic_add(&counted->drawn, drawn);
-    if (whole > drawn + turned) atomic_add(&counted->degenerate, whole - drawn - turned);
-    if (turned) atomic_add(&counted->turned, turned);
-    if (beside) atomic_add(&counted->beside, beside);
-    if (cut) atomic_add(&counted->crossing, cut);
-    if (behind) atomic_add(&counted->behind, behind);
+    set_up_part(get_global_id(0), get_global_id(1), views, projected, faces, tags, triangles, slots, labels, boxes,
+                coarse, crossing, counters, objects, count, padded, stride, n_object);
 }
 
 typedef struct {
@@ -161,35 +176,42 @@ __kernel void cut_faces(__global const View *restrict views, __global const doub
             }
             int corners = 3;
             for (int plane = 0; plane < 5 && corners; plane++) corners = cut(corner, corners, plane, view->near);
-            for (int k = 1; k + 1 < corners; k++, n++) {
-                if (padded + n >= stride) continue;  // the host gives more room and asks again
-                const int fan[3] = {0, k, k + 1}, s = view->slots + padded + n;
-                int x[3], y[3], front = 0, box[4] = {LIMIT, LIMIT, LIMIT, LIMIT};
-                double q[3];
+            // The pieces fan out from the first corner, at most seven of them.
+            const int pieces = MAX(corners - 2, 0), fits = MIN(pieces, stride - padded - n);
+            const int s = view->slots + padded + n;
+            n += pieces;
+            if (fits <= 0) continue;  // the host gives more room and asks again
+            Corners on_screen;
+            for (int l = 0; l < 16; l++) {
+                const int piece = MIN(l, pieces - 1), fan[3] = {0, piece + 1, piece + 2};
                 for (int c = 0; c < 3; c++) {
                     const Corner *at = corner + fan[c];
-                    x[c] = (int)rint(at->at[0] / at->at[2] * SUBPIXELS);
-                    y[c] = (int)rint(at->at[1] / at->at[2] * SUBPIXELS);
-                    q[c] = view->perspective ? 1.0 / at->at[2] : at->at[3];
+                    on_screen.x[c].lane[l] = (int)rint(at->at[0] / at->at[2] * SUBPIXELS);
+                    on_screen.y[c].lane[l] = (int)rint(at->at[1] / at->at[2] * SUBPIXELS);
+                    on_screen.q[c].lane[l] = view->perspective ? 1.0 / at->at[2] : at->at[3];
                 }
-                double4 planes[3];
-                // The eye may be inside: nothing is left out.
-                if (set_up_triangle(view, x, y, q, 0, &front, triangles + s, planes, box)) {
-                    // From the piece's own corners to those of the face.
-                    for (int r = 0; r < 3; r++) {
-                        const double part[3] = {planes[r].x, planes[r].y, planes[r].z};
-                        double whole[3] = {0, 0, 0};
-                        for (int c = 0; c < 3; c++)
-                            for (int j = 0; j < 3; j++) whole[j] += part[c] * corner[fan[c]].share[j];
-                        planes[r] = (double4)(whole[0], whole[1], whole[2], planes[r].w);
-                    }
-                    keep_planes(slots + s, labels + s, planes, box);
-                    counted->drawn++;
+            }
+            Planes planes;
+            // The eye may be inside: nothing is left out.
+            const int drawn = set_up_triangles(view, &on_screen, (1 << fits) - 1, 0, triangles + s, &planes);
+            for (int rest = drawn; rest; rest &= rest - 1) {
+                // From the piece's own corners to those of the face.
+                const int l = __builtin_ctz(rest), fan[3] = {0, l + 1, l + 2};
+                Doubles *rows[3] = {planes.at, planes.x, planes.y};
+                for (int r = 0; r < 3; r++) {
+                    double share[3] = {0, 0, 0};
+                    for (int c = 0; c < 3; c++)
+                        for (int j = 0; j < 3; j++) share[j] += rows[r][c].lane[l] * corner[fan[c]].share[j];
+                    for (int j = 0; j < 3; j++) rows[r][j].lane[l] = share[j];
                 }
-                labels[s].face = f;
-                labels[s].tag = tags[f].x | (front ? FRONT : 0);
-                labels[s].object = tags[f].y;
-                for (int b = 0; b < 4; b++) box_of[b * stride + padded + n] = box[b];
+            }
+            keep_planes(slots + s, labels + s, drawn, &planes);
+            counted->drawn += __builtin_popcount(drawn);
+            for (int l = 0; l < fits; l++) {
+                labels[s + l].face = f;
+                labels[s + l].tag = tags[f].x | (planes.front >> l & 1 ? FRONT : 0);
+                labels[s + l].object = tags[f].y;
+                for (int b = 0; b < 4; b++) box_of[b * stride + padded + n - pieces + l] = planes.box[b].lane[l];
             }
         }
     }

@@ -33,8 +33,9 @@ GUARD_BAND = 16384.0
 """Pixels around the origin beyond which triangles are cut; keeps the integers of the edge functions below 2^52."""
 
 
-TILE, STAMPS, ROOM = 64, 256, 4
-"""Side of a tile in pixels, its stamps, and the layers a stamp begins with, in kernels_cl/render/rasterize.clh."""
+TILE, STAMPS, ROOM, VECTORS = 64, 256, 4, 8
+"""Side of a tile in pixels, its stamps, the layers a stamp begins with, and how many times sixteen faces a work-item sets
+up, in kernels_cl/render/rasterize.clh."""
 
 TRIANGLE_BYTES, SLOT_BYTES, LABEL_BYTES, PROJECTED_BYTES, LIMIT = 96, 48, 16, 24, 1 << 30
 """Sizes of the kernels' structures, and what no box reaches."""
@@ -350,14 +351,16 @@ def _overlap(camera: Camera, boxes: Float[np.ndarray, "object 8 3"]) -> tuple[np
 
     In numpy, for its speed on a few numbers.
     """
-    x, y, back = np.moveaxis((boxes - camera.eye.double().numpy()) @ camera.axes.double().numpy().T, -1, 0)
-    w = -back if camera.projection == "perspective" else np.ones_like(back)
-    ahead = -back > camera.near
-    size = camera.pixel_size * w
-    right, top = (camera.width / 2 + 1) * size, (camera.height / 2 + 1) * size
-    beside = (x < -right).all(1) | (x > right).all(1) | (y < -top).all(1) | (y > top).all(1) | ~ahead.any(1)
-    reach = (GUARD_BAND - max(camera.width, camera.height)) * size
-    return beside, ahead.all(1), (ahead & (np.abs(x) < reach) & (np.abs(y) < reach)).all(1)
+    local = (boxes - camera.eye.double().numpy()) @ camera.axes.double().numpy().T
+    depth = -local[..., 2]
+    ahead = depth > camera.near
+    # In pixels from the middle of the picture; each bound of the view leaves a pixel of room.
+    across = local[..., :2] / camera.pixel_size
+    w = depth[..., None] if camera.projection == "perspective" else 1.0
+    room = np.array([camera.width / 2 + 1, camera.height / 2 + 1]) * w
+    beside = ((across < -room).all(1) | (across > room).all(1)).any(-1) | ~ahead.any(1)
+    safe = (np.abs(across) < (GUARD_BAND - max(camera.width, camera.height)) * w).all(-1)
+    return beside, ahead.all(1), (ahead & safe).all(1)
 
 
 class DeviceViews:
@@ -404,7 +407,7 @@ class DeviceViews:
                 (self.views, mesh.vertices, self.projected, np.int32(mesh.n_vertex)),
             ),
             "triangles": opencl.Call(
-                path, "set_up", (-(-(self.padded // 16) // 8) * 8, count), (8, 1),
+                path, "set_up", (-(-(self.padded // 16) // VECTORS), count), (1, 1),
                 (self.views, self.projected, mesh.faces, mesh.tags, *screen, *sizes),
             ),
             "cut triangles": opencl.Call(

@@ -124,7 +124,7 @@ class Renderer:
     def _reaches(self, light: Light) -> bool:
         """Return whether any light falls on any object; in doubt it does."""
         power = light.irradiance if isinstance(light, DirectionalLight) else light.intensity
-        if not bool((power > 0).any()):
+        if max(power.tolist()) <= 0:
             return False
         if not isinstance(light, SpotLight):
             return True

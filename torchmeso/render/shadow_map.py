@@ -22,7 +22,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchmeso.data.mdf import MIN_COS
-from torchmeso.geometry import frames
 from torchmeso.geometry.camera import Camera
 from torchmeso.geometry.directions import dot, normalize
 from torchmeso.geometry.light import DirectionalLight, Light, SpotLight
@@ -123,10 +122,8 @@ def cameras(world: World, light: Light, size: int) -> list[Camera]:
     """Return the views from a light: one around all of the scene, one along a cone, or six faces of a cube."""
     corners = world.vertices.double()
     if isinstance(light, DirectionalLight):
-        frame = frames.around(light.direction.double())
-        axes = torch.stack([frame.t, frame.b, frame.n])
-        local = corners @ axes.T
-        low, high = local.amin(0), local.amax(0)
+        axes = _axes(light.direction)
+        low, high = (axes @ corners.T).aminmax(dim=1)
         extent = float((high - low).max()) * (1 + 4 / size) + 1e-9
         eye = ((low + high) / 2) @ axes + axes[2] * extent
         return [
@@ -136,8 +133,7 @@ def cameras(world: World, light: Light, size: int) -> list[Camera]:
     eye = light.position.double()
     near = max(1e-4 * float((corners - eye).norm(dim=-1).max()), 1e-9)
     if isinstance(light, SpotLight):
-        frame = frames.around(-light.axis.double())
-        axes = torch.stack([frame.t, frame.b, frame.n])
+        axes = _axes(-light.axis)
         # A texel more on every side, so that the rim of the cone is covered.
         fov = 2 * math.degrees(math.atan(math.tan(math.radians(light.outer_deg)) * (1 + 4 / size)))
         return [Camera(eye=eye, axes=axes, fov_deg=fov, width=size, height=size, near=near)]
@@ -146,9 +142,23 @@ def cameras(world: World, light: Light, size: int) -> list[Camera]:
     cube = []
     for axis in range(3):
         for sign in (1.0, -1.0):
-            back = torch.zeros(3, dtype=torch.float64)
+            back = torch.zeros(3)
             back[axis] = sign
-            frame = frames.around(back)
-            axes = torch.stack([frame.t, frame.b, frame.n])
-            cube.append(Camera(eye=eye, axes=axes, fov_deg=fov, width=side, height=side, near=near))
+            cube.append(Camera(eye=eye, axes=_axes(back), fov_deg=fov, width=side, height=side, near=near))
     return cube
+
+
+def _axes(back: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
+    """Return axes of a camera that looks along -`back`, as `frames.around`; in floats, for lights that move."""
+    n = back.tolist()
+    length = math.hypot(*n)
+    n = [x / length for x in n]
+    least = min(range(3), key=lambda k: abs(n[k]))
+    t = _cross(n, [float(k == least) for k in range(3)])
+    length = math.hypot(*t)
+    t = [x / length for x in t]
+    return torch.tensor([t, _cross(n, t), n], dtype=torch.float64)
+
+
+def _cross(a: list[float], b: list[float]) -> list[float]:
+    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
