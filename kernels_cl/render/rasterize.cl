@@ -1,32 +1,12 @@
-// The rasteriser's kernels: vertices, triangles, those that are cut, and tiles.
+// The rasteriser's kernels: triangles, those that are cut, and tiles.
 // Host: torchmeso/render/rasterize.py
 
 #include "render/rasterize.clh"
 
 #pragma OPENCL FP_CONTRACT OFF
 
-// Projects one vertex for one view.
-__kernel void project(__global const View *restrict views, __global const double *restrict vertices,  // (V, 3)
-                      __global Projected *restrict out, const int count)
-{
-    const int i = get_global_id(0);
-    if (i >= count) return;
-    __global const View *view = views + get_global_id(1);
-    const double4 p = project_point(view, vertices[3 * i], vertices[3 * i + 1], vertices[3 * i + 2]);
-    const double x = p.x / p.z, y = p.y / p.z;
-    Projected r;
-    r.q = view->perspective ? 1.0 / p.z : p.w;
-    const int ahead = p.w >= view->near;
-    const int safe = ahead && x <= GUARD_BAND && x >= -GUARD_BAND && y <= GUARD_BAND && y >= -GUARD_BAND;
-    r.x = safe ? (int)rint(x * SUBPIXELS) : 0;
-    r.y = safe ? (int)rint(y * SUBPIXELS) : 0;
-    r.state = (ahead ? AHEAD : 0) | (safe ? SAFE : 0);
-    r.pad = 0;
-    out[view->vertices + i] = r;
-}
-
 static INNER void set_up_part(const int part, const int number, __global const View *restrict views,
-                              __global const Projected *restrict projected, __global const int *restrict faces,
+                              __global const double *restrict vertices, __global const int *restrict faces,
                               __global const int2 *restrict tags, __global Triangle *restrict triangles,
                               __global Slot *restrict slots, __global Label *restrict labels,
                               __global int *restrict boxes, __global int *restrict coarse,
@@ -35,7 +15,6 @@ static INNER void set_up_part(const int part, const int number, __global const V
                               const int stride, const int n_object)
 {
     __global const View *view = views + number;
-    __global const Projected *p = projected + view->vertices;
     __global Counters *counted = counters + number;
     const int coarse_stride = ((stride >> 4) + 15) & ~15;
     __global int *box_of = boxes + 4 * view->slots;
@@ -44,30 +23,36 @@ static INNER void set_up_part(const int part, const int number, __global const V
     int drawn = 0, degenerate = 0, turned = 0, aside = 0, crossed = 0, behind = 0;
     for (int v = VECTORS * part; v < MIN(VECTORS * (part + 1), padded >> 4); v++) {
         __global Label *label = labels + view->slots + 16 * v;
-        Corners corners = {0};
-        int whole = 0, hidden = 0, crosses = 0;
-        for (int lane = 0; lane < 16; lane++) {
-            const int f = 16 * v + lane, bit = 1 << lane;
-            if (f >= count) break;
-            int ahead = 0, safe = 0;
-            for (int k = 0; k < 3; k++) {
-                const Projected at = p[faces[3 * f + k]];
-                corners.x[k].lane[lane] = at.x;
-                corners.y[k].lane[lane] = at.y;
-                corners.q[k].lane[lane] = at.q;
-                ahead += at.state & AHEAD;
-                safe += at.state & SAFE;
+        const int lanes = (1 << MIN(16, count - 16 * v)) - 1;
+        Corners corners;
+        int ahead = 0, safe = lanes, hidden = 0, beside = 0;
+        for (int k = 0; k < 3; k++) {
+            Doubles point[3] = {{0.0}, {0.0}, {0.0}};
+            for (int rest = lanes; rest; rest &= rest - 1) {
+                const int lane = __builtin_ctz(rest);
+                __global const double *p = vertices + 3 * faces[3 * (16 * v + lane) + k];
+                point[0].lane[lane] = p[0], point[1].lane[lane] = p[1], point[2].lane[lane] = p[2];
             }
+            const Projected p = project(view, point);
+            const double16 x = p.x.vector / p.w.vector, y = p.y.vector / p.w.vector;
+            const int before = to_bits(TO_INT(p.depth.vector >= view->near));
+            const int16 within = TO_INT((x <= GUARD_BAND) & (x >= -GUARD_BAND) & (y <= GUARD_BAND) & (y >= -GUARD_BAND));
+            corners.x[k].vector = within ? snap(x) : (int16)0;
+            corners.y[k].vector = within ? snap(y) : (int16)0;
+            corners.q[k].vector = view->perspective ? 1.0 / p.w.vector : p.depth.vector;
+            ahead |= before;
+            safe &= before & to_bits(within);
+        }
+        for (int rest = lanes; rest; rest &= rest - 1) {
+            const int lane = __builtin_ctz(rest), f = 16 * v + lane;
             const int2 tag = tags[f];
-            if (beside_of[tag.y]) aside++;
-            else if (safe == 3 * SAFE) whole |= bit;
-            else if (ahead) crosses |= bit;
-            else behind++;
-            if (view->cull && tag.x & CLOSED) hidden |= bit;
+            beside |= (beside_of[tag.y] != 0) << lane;
+            hidden |= (view->cull && tag.x & CLOSED) << lane;
             label[lane].face = f;
             label[lane].tag = tag.x;
             label[lane].object = tag.y;
         }
+        const int whole = safe & ~beside, crosses = lanes & ahead & ~safe & ~beside;
         Planes planes;
         const int made = set_up_triangles(view, &corners, whole, hidden, triangles + view->slots + 16 * v, &planes);
         keep_planes(slots + view->slots + 16 * v, label, made, &planes);
@@ -84,6 +69,8 @@ static INNER void set_up_part(const int part, const int number, __global const V
         degenerate += __builtin_popcount(whole & ~made & ~planes.turned);
         turned += __builtin_popcount(planes.turned);
         crossed += __builtin_popcount(crosses);
+        aside += __builtin_popcount(beside);
+        behind += __builtin_popcount(lanes & ~ahead & ~beside);
     }
     if (drawn) atomic_add(&counted->drawn, drawn);
     if (degenerate) atomic_add(&counted->degenerate, degenerate);
@@ -94,7 +81,7 @@ static INNER void set_up_part(const int part, const int number, __global const V
 }
 
 // Sets up 16 VECTORS faces for one view. `slots` triangles of a view stand together, cut ones behind the others.
-__kernel void set_up(__global const View *restrict views, __global const Projected *restrict projected,
+__kernel void set_up(__global const View *restrict views, __global const double *restrict vertices,  // (V, 3)
                      __global const int *restrict faces,   // (F, 3)
                      __global const int2 *restrict tags,   // (F) component << 2 | CLOSED, object
                      __global Triangle *restrict triangles, __global Slot *restrict slots,
@@ -106,7 +93,7 @@ __kernel void set_up(__global const View *restrict views, __global const Project
                      __global const int *restrict objects,  // (view, object) whether it lies beside the view
                      const int count, const int padded, const int stride, const int n_object)
 {
-    set_up_part(get_global_id(0), get_global_id(1), views, projected, faces, tags, triangles, slots, labels, boxes,
+    set_up_part(get_global_id(0), get_global_id(1), views, vertices, faces, tags, triangles, slots, labels, boxes,
                 coarse, crossing, counters, objects, count, padded, stride, n_object);
 }
 
@@ -168,10 +155,13 @@ __kernel void cut_faces(__global const View *restrict views, __global const doub
         for (int f = 0; f < count; f++) {
             if (!crossing[number * padded + f]) continue;
             Corner corner[9];
+            Doubles point[3] = {{0.0}, {0.0}, {0.0}};
+            for (int k = 0; k < 3; k++)
+                for (int c = 0; c < 3; c++) point[c].lane[k] = vertices[3 * faces[3 * f + k] + c];
+            const Projected p = project(view, point);
             for (int k = 0; k < 3; k++) {
-                __global const double *v = vertices + 3 * faces[3 * f + k];
-                const double4 p = project_point(view, v[0], v[1], v[2]);
-                corner[k].at[0] = p.x, corner[k].at[1] = p.y, corner[k].at[2] = p.z, corner[k].at[3] = p.w;
+                corner[k].at[0] = p.x.lane[k], corner[k].at[1] = p.y.lane[k];
+                corner[k].at[2] = p.w.lane[k], corner[k].at[3] = p.depth.lane[k];
                 for (int c = 0; c < 3; c++) corner[k].share[c] = c == k;
             }
             int corners = 3;
@@ -182,14 +172,19 @@ __kernel void cut_faces(__global const View *restrict views, __global const doub
             n += pieces;
             if (fits <= 0) continue;  // the host gives more room and asks again
             Corners on_screen;
+            Doubles x[3], y[3];
             for (int l = 0; l < 16; l++) {
                 const int piece = MIN(l, pieces - 1), fan[3] = {0, piece + 1, piece + 2};
                 for (int c = 0; c < 3; c++) {
                     const Corner *at = corner + fan[c];
-                    on_screen.x[c].lane[l] = (int)rint(at->at[0] / at->at[2] * SUBPIXELS);
-                    on_screen.y[c].lane[l] = (int)rint(at->at[1] / at->at[2] * SUBPIXELS);
+                    x[c].lane[l] = at->at[0] / at->at[2];
+                    y[c].lane[l] = at->at[1] / at->at[2];
                     on_screen.q[c].lane[l] = view->perspective ? 1.0 / at->at[2] : at->at[3];
                 }
+            }
+            for (int c = 0; c < 3; c++) {
+                on_screen.x[c].vector = snap(x[c].vector);
+                on_screen.y[c].vector = snap(y[c].vector);
             }
             Planes planes;
             // The eye may be inside: nothing is left out.

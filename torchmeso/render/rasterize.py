@@ -37,12 +37,12 @@ TILE, STAMPS, ROOM, VECTORS = 64, 256, 4, 8
 """Side of a tile in pixels, its stamps, the layers a stamp begins with, and how many times sixteen faces a work-item sets
 up, in kernels_cl/render/rasterize.clh."""
 
-TRIANGLE_BYTES, SLOT_BYTES, LABEL_BYTES, PROJECTED_BYTES, LIMIT = 96, 48, 16, 24, 1 << 30
+TRIANGLE_BYTES, SLOT_BYTES, LABEL_BYTES, LIMIT = 96, 48, 16, 1 << 30
 """Sizes of the kernels' structures, and what no box reaches."""
 
 VIEW = np.dtype(
     [("eye", "f8", 3), ("axes", "f8", (3, 3)), ("pixel_size", "f8"), ("near", "f8")]
-    + [(name, "i4") for name in ("width", "height", "perspective", "vertices", "slots", "texels", "cull", "outside")]
+    + [(name, "i4") for name in ("width", "height", "perspective", "slots", "texels", "cull", "outside", "pad")]
 )
 """A camera as the kernels read it."""
 
@@ -382,7 +382,6 @@ class DeviceViews:
         self._counters = opencl.Shared(np.zeros((count, 32), np.int32))
         self._beside = opencl.Shared(np.zeros((count, len(mesh.boxes)), np.int32))
         self.views, self.counters = self._views.buffer, self._counters.buffer
-        self.projected = opencl.allocate(count * mesh.n_vertex * PROJECTED_BYTES)
         self.triangles = opencl.allocate(count * self.stride * TRIANGLE_BYTES)
         self.slots = opencl.allocate(count * self.stride * SLOT_BYTES)
         self.labels = opencl.allocate(count * self.stride * LABEL_BYTES)
@@ -402,13 +401,9 @@ class DeviceViews:
         )
         path = "render/rasterize.cl"
         self.steps = {
-            "vertices": opencl.Call(
-                path, "project", (-(-mesh.n_vertex // 64) * 64, count), (64, 1),
-                (self.views, mesh.vertices, self.projected, np.int32(mesh.n_vertex)),
-            ),
             "triangles": opencl.Call(
                 path, "set_up", (-(-(self.padded // 16) // VECTORS), count), (1, 1),
-                (self.views, self.projected, mesh.faces, mesh.tags, *screen, *sizes),
+                (self.views, mesh.vertices, mesh.faces, mesh.tags, *screen, *sizes),
             ),
             "cut triangles": opencl.Call(
                 path, "cut_faces", (count,), (1,), (self.views, mesh.vertices, mesh.faces, mesh.tags, *screen, *sizes)
@@ -430,7 +425,7 @@ class DeviceViews:
             r["pixel_size"], r["near"] = camera.pixel_size, camera.near
             r["width"], r["height"] = camera.width, camera.height
             r["perspective"] = camera.projection == "perspective"
-            r["vertices"], r["slots"] = i * self.mesh.n_vertex, i * self.stride
+            r["slots"] = i * self.stride
             beside, ahead, whole = _overlap(camera, self.mesh.boxes)
             outside = bool((ahead | beside | ~self.mesh.bodies).all())
             r["texels"], r["cull"], r["outside"] = texels, cull and outside, outside
@@ -444,7 +439,6 @@ class DeviceViews:
         counters[:, COUNTERS.index("vectors")] = self.padded // 16
         for shared in (self._views, self._counters, self._beside):
             shared.send()
-        self.steps["vertices"]()
         self.steps["triangles"]()
         if self.may_cut or self._was_cut:
             self.steps["cut triangles"]()
