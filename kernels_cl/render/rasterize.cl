@@ -1,5 +1,5 @@
 // The rasteriser's kernels: triangles, those that are cut, and tiles.
-// Host: torchmeso/render/rasterize.py
+// Host: torchmeso/render/device_raster.py; the formula: torchmeso/render/rasterize.py
 
 #include "render/rasterize.clh"
 

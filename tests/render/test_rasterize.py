@@ -5,12 +5,11 @@ import pytest
 import torch
 
 from tests.reference.rasterize import a_buffer
-from tests.tolerances import OPENCL_DEPTH
 from torchmeso.geometry import shapes
 from torchmeso.geometry.camera import Camera, look_at
 from torchmeso.geometry.rays import RayScene
 from torchmeso.render import rasterize as module
-from torchmeso.render.rasterize import DeviceRaster, barycentric, rasterize, set_up, upload_mesh
+from torchmeso.render.rasterize import barycentric, rasterize, set_up
 
 KINDS = ("shared edges", "slivers", "coincident faces", "behind the eye", "soup", "on pixel centres")
 
@@ -206,71 +205,6 @@ def test_empty_and_invisible_meshes():
     for layers in (nothing, behind, point):
         assert len(layers.t) == 0
         assert (layers.start == 0).all()
-
-
-def drawn(view, points, faces):
-    """The fragments of the kernels, and of torch with equal depths put in the order of faces."""
-    exact = rasterize(view, points, faces)
-    raster = DeviceRaster(upload_mesh(points, faces), view.width, view.height)
-    return exact, exact.triangles.face[exact.triangle], raster.lists(view)
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_opencl_draws_the_same_fragments(kind, device):
-    rng = np.random.default_rng(7)
-    for _ in range(8):
-        view, points, faces = scene(kind, rng)
-        exact, face, fast = drawn(view, torch.from_numpy(points), torch.from_numpy(faces))
-        assert torch.equal(exact.pixel, fast.pixel)
-        # Pieces of one cut face share its number, so fragments are compared as sets of (pixel, face).
-        order, order_2 = (np.lexsort((f, exact.pixel)) for f in (face, fast.face))
-        assert torch.equal(face[order], fast.face[order_2])
-        assert ((exact.t - fast.t).abs() / exact.t).max() < OPENCL_DEPTH["rtol"] if len(fast.t) else True
-        same = fast.pixel[1:] == fast.pixel[:-1]
-        assert (fast.t.diff()[same] >= -1e-6 * fast.t[1:][same]).all()
-
-
-def test_opencl_orders_coincident_faces_by_number(device):
-    corners = torch.tensor([[-1.0, -1, 0], [1, -1, 0], [0, 1, 0]]).repeat(20, 1)
-    _, _, fast = drawn(camera(), corners, torch.arange(60).reshape(20, 3))
-    same = fast.pixel[1:] == fast.pixel[:-1]
-    assert len(fast.t) % 20 == 0
-    assert (fast.face.diff()[same] == 1).all()
-
-
-@pytest.mark.parametrize("size", [(1, 1), (3, 5), (65, 63), (130, 70)])
-def test_opencl_pictures_of_any_size(size, device):
-    mesh = shapes.torus_knot(triangles=2000)
-    exact, face, fast = drawn(camera(*size), mesh.vertices, mesh.faces)
-    assert torch.equal(exact.pixel, fast.pixel)
-    assert torch.equal(face, fast.face)
-
-
-def test_opencl_drops_nothing(device):
-    """Three hundred layers everywhere: more room is asked for than there was at first."""
-    z = torch.linspace(-0.5, 0.5, 300)
-    corner = torch.tensor([[-3.0, -3, 0], [3, -3, 0], [0, 4, 0]])
-    vertices = (corner[None] + torch.stack([0 * z, 0 * z, z], -1)[:, None]).reshape(-1, 3)
-    faces = torch.arange(900).reshape(-1, 3)
-    exact, face, fast = drawn(camera(projection="orthographic"), vertices, faces)
-    assert exact.start.diff().max() == 300
-    assert torch.equal(exact.pixel, fast.pixel)
-    assert torch.equal(face, fast.face)
-
-
-def test_opencl_makes_room_for_triangles_that_are_cut(device):
-    """More faces cross the near plane than there was room for at first."""
-    rng = np.random.default_rng(3)
-    view = camera()
-    corners = view.eye.numpy() + rng.normal(size=(3000, 3, 3)) * 0.3
-    exact, face, fast = drawn(view, torch.from_numpy(corners.reshape(-1, 3)), torch.arange(9000).reshape(-1, 3))
-    assert torch.equal(exact.pixel, fast.pixel)
-    assert torch.equal(face.bincount(minlength=3000), fast.face.bincount(minlength=3000))
-
-
-def test_opencl_with_nothing_to_draw(device):
-    _, _, fast = drawn(camera(), torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.long))
-    assert len(fast.t) == 0
 
 
 def test_front_is_by_the_corners():

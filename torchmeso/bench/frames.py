@@ -17,7 +17,7 @@ from torchmeso.config import Config
 from torchmeso.geometry.camera import Camera
 from torchmeso.pipeline import scene as scenes
 from torchmeso.pipeline.bake import Report, prepare, silent
-from torchmeso.render.rasterize import DeviceRaster, upload_mesh
+from torchmeso.render.device_raster import DeviceRaster, upload_mesh
 from torchmeso.render.scene import Scene, assemble
 
 SMALL: dict[str, Any] = {

@@ -36,8 +36,9 @@ from torchmeso.pipeline import scene as pipeline_scene
 from torchmeso.pipeline import truth
 from torchmeso.pipeline.demo import built_in
 from torchmeso.render import frame, shadow_map
+from torchmeso.render.device_raster import DeviceRaster, upload_mesh
 from torchmeso.render.frame import FrameOptions
-from torchmeso.render.rasterize import DeviceRaster, rasterize, upload_mesh
+from torchmeso.render.rasterize import rasterize
 from torchmeso.render.scene import DistanceFunction, Material, Object, Scene, assemble
 from torchmeso.render.silhouette import Silhouette
 from torchmeso.transport.tracer import MeshTracer

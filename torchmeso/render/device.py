@@ -23,7 +23,7 @@ from torchmeso.geometry import hemisphere
 from torchmeso.geometry.directions import normalize
 from torchmeso.geometry.hemisphere import DirectionSet
 from torchmeso.geometry.light import DirectionalLight, Light, SpotLight
-from torchmeso.render.rasterize import DeviceMesh, upload_mesh
+from torchmeso.render.device_raster import DeviceMesh, upload_mesh
 from torchmeso.render.scene import Material, Scene, World
 
 BLOCK, GROUP = 64, 4

@@ -21,9 +21,9 @@ from torchmeso.errors import BackendError, check_memory
 from torchmeso.geometry.camera import Camera
 from torchmeso.geometry.light import DirectionalLight, Light, SpotLight
 from torchmeso.render import device, shadow_map
+from torchmeso.render.device_raster import ROOM, STAMPS, TILE, DeviceViews
 from torchmeso.render.film import Picture
 from torchmeso.render.frame import MEMORY_LIMIT, FrameOptions
-from torchmeso.render.rasterize import ROOM, STAMPS, TILE, DeviceViews
 from torchmeso.render.scene import Scene, assemble
 
 MAX_LIGHTS = 64
@@ -128,10 +128,8 @@ class Renderer:
             return False
         if not isinstance(light, SpotLight):
             return True
-        boxes = self._device.mesh.boxes
-        centre = boxes.mean(1)
-        radius = np.linalg.norm(boxes - centre[:, None], axis=-1).max(1)
-        way = centre - light.position.double().numpy()
+        radius = np.linalg.norm(self._device.mesh.half, axis=-1)
+        way = self._device.mesh.centre - light.position.double().numpy()
         distance = np.maximum(np.linalg.norm(way, axis=-1), 1e-30)
         off_axis = np.arccos(np.clip(way @ light.axis.double().numpy() / distance, -1, 1))
         seen_under = np.arcsin(np.minimum(radius / distance, 1))
@@ -211,19 +209,21 @@ class Renderer:
         if self._picture is None or self._picture.key != key:
             self._picture = self._make_picture(key)
         picture, scene, maps = self._picture, self._scene, self._maps
-        records = picture.lights.array
-        records[: max(len(lights), 1)] = device.light_records(lights)
-        if maps is not None:
-            records["faces"][: len(lights)] = maps.faces
-            records["first_face"][: len(lights)] = np.cumsum([0, *maps.faces[:-1]])
-        frame = picture.frame.array
+        if picture.shone is not lights:
+            records = picture.lights.array
+            records[: max(len(lights), 1)] = device.light_records(lights)
+            if maps is not None:
+                records["faces"][: len(lights)] = maps.faces
+                records["first_face"][: len(lights)] = np.cumsum([0, *maps.faces[:-1]])
+            picture.lights.send()
+            picture.shone = lights
+        frame = picture.frame.array[0]
         frame["lights"], frame["ambient_paper"] = len(lights), scene.ambient_rule == "paper"
         frame["depths"], frame["outputs"] = outputs == DETAILS or maps is not None, outputs
         frame["capacity"], frame["stride"] = self._taken + self._extra, picture.views.stride
         frame["skips"], frame["rank_error"] = self._skip_bits(), self.options.rank_error
         frame["pitch"] = picture.rgba.shape[1]
         frame["ambient"], frame["background"] = scene.ambient, scene.background
-        picture.lights.send()
         picture.frame.send()
         if outputs != picture.outputs:
             picture.empty.array[:] = 0
@@ -298,6 +298,7 @@ class _Picture:
     owner: Tensor
     shadowed: Tensor
     outputs: int = 0
+    shone: tuple[Light, ...] | None = None
     lit: tuple[int, list[int]] = (0, [])
 
     def finished(self, camera: Camera, counts: dict[str, int], seconds: dict[str, float]) -> Picture:

@@ -1,0 +1,272 @@
+"""All layers of a mesh on OpenCL: its triangles on the screens of cameras, and tiles filled with every fragment.
+
+Tiles of a picture are walked by triangles, 4 x 4 pixels at once; the fragments are those of `rasterize`, which is the
+formula of all of this. Frames (`renderer`) and shadow maps fill their tiles in kernels of their own.
+
+Kernels: kernels_cl/render/rasterize.cl          Test: tests/render/test_device_raster.py
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchmeso.backends import opencl
+from torchmeso.geometry.camera import Camera
+from torchmeso.render.rasterize import GUARD_BAND
+
+TILE, STAMPS, ROOM, VECTORS = 64, 256, 4, 8
+"""Side of a tile in pixels, its stamps, layers a stamp begins with, and sixteens of faces that a work-item sets up; in
+kernels_cl/render/rasterize.clh."""
+
+TRIANGLE_BYTES, SLOT_BYTES, LABEL_BYTES, LIMIT = 96, 48, 16, 1 << 30
+"""Sizes of the kernels' structures, and what no box reaches."""
+
+VIEW = np.dtype(
+    [("eye", "f8", 3), ("axes", "f8", (3, 3)), ("pixel_size", "f8"), ("near", "f8")]
+    + [(name, "i4") for name in ("width", "height", "perspective", "slots", "texels", "cull", "outside", "pad")]
+)
+"""A camera as the kernels read it."""
+
+COUNTERS = (
+    "used", "vectors", "slots", "tile", "crossing", "behind", "degenerate", "drawn", "fragments",
+    "deepest", "covered", "intervals", "deep", "carved", "inside", "hidden", "looked", "spared", "empty_tiles",
+    "beside", "turned", "losers", "bounded",
+)  # fmt: skip
+"""What the kernels count, in the order of `Counters` in kernels_cl/render/rasterize.clh; padded to 32."""
+
+
+class DeviceMesh(NamedTuple):
+    """Triangles as the kernels read them.
+
+    Attributes:
+        vertices: (V, 3) float64.
+        faces: (F, 3) int32.
+        tags: (F, 2) int32: component << 2 | 2 where it is closed; object.
+        centre: (object, 3) float64 middle of the box around each object.
+        half: (object, 3) half its sides.
+        bodies: (object,) whether an object has closed components.
+        n_vertex: V.
+        n_face: F.
+    """
+
+    vertices: "opencl.Buffer"
+    faces: "opencl.Buffer"
+    tags: "opencl.Buffer"
+    centre: Float[np.ndarray, "object 3"]
+    half: Float[np.ndarray, "object 3"]
+    bodies: Bool[np.ndarray, "object"]
+    n_vertex: int
+    n_face: int
+
+
+class DeviceLists(NamedTuple):
+    """All fragments of a picture, pixel by pixel, near to far; ties in depth are ordered by triangle.
+
+    Attributes:
+        pixel: (N,) row * width + column, ascending.
+        face: (N,) triangle of the mesh.
+        t: (N,) float32 distance along the pixel's ray, near to far in each pixel.
+    """
+
+    pixel: Int[Tensor, "N"]
+    face: Int[Tensor, "N"]
+    t: Float[Tensor, "N"]
+
+
+def upload_mesh(
+    vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], tags: Int[Tensor, "F 2"] | None = None
+) -> DeviceMesh:
+    """Return a mesh on the device; without `tags` an open surface.
+
+    Raises:
+        BackendError: there is no OpenCL device.
+    """
+    tags = torch.zeros(len(faces), 2, dtype=torch.int32) if tags is None else tags
+    boxes, bodies = [], []
+    for i in range(int(tags[:, 1].max()) + 1 if len(tags) else 1):
+        p = vertices[faces[tags[:, 1] == i].unique()].double()
+        bodies.append(bool((tags[tags[:, 1] == i, 0] & 2).any()))
+        box = torch.stack([p.amin(0), p.amax(0)]) if len(p) else torch.zeros(2, 3, dtype=torch.float64)
+        boxes.append(box.numpy())
+    low, high = np.stack(boxes, 1)
+    return DeviceMesh(
+        opencl.upload(vertices.double().numpy()), opencl.upload(faces.int().numpy()),
+        opencl.upload(tags.int().numpy()), (low + high) / 2, (high - low) / 2, np.array(bodies),
+        len(vertices), len(faces),
+    )  # fmt: skip
+
+
+def overlap(camera: Camera, mesh: DeviceMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return whether each object's box is beside the view, ahead of the eye, and also within the guard band.
+
+    In a few calls of numpy, because it is done for every frame.
+    """
+    perspective = camera.projection == "perspective"
+    # A pixel of room at each side of the view; the guard band is met within any part of the picture.
+    right, top = camera.pixel_size * (camera.width / 2 + 1), camera.pixel_size * (camera.height / 2 + 1)
+    guard = camera.pixel_size * (GUARD_BAND - max(camera.width, camera.height))
+    planes = []
+    for across, up in ((right, top), (guard, guard)):
+        for side in (-1.0, 1.0):
+            planes += [[side, 0.0, -across, 0.0] if perspective else [side, 0.0, 0.0, across]]
+            planes += [[0.0, side, -up, 0.0] if perspective else [0.0, side, 0.0, up]]
+    k = np.array([*planes, [0.0, 0.0, -1.0, -camera.near]])
+    n = k[:, :3] @ camera.axes.double().numpy()
+    middle = n @ (mesh.centre - camera.eye.double().numpy()).T + k[:, 3:]
+    reach = np.abs(n) @ mesh.half.T
+    within = middle > reach
+    return (middle[[0, 1, 2, 3, 8]] < -reach[[0, 1, 2, 3, 8]]).any(0), within[8], within[4:].all(0)
+
+
+class DeviceViews:
+    """Cameras on one mesh: its triangles on their screens, on the device."""
+
+    def __init__(self, mesh: DeviceMesh, count: int, *, cut_room: int = 0):
+        """Make room for `count` views.
+
+        Args:
+            mesh: what is seen.
+            count: cameras.
+            cut_room: triangles that faces may become which cross the near plane or the guard band.
+        """
+        self.mesh, self.count, self.may_cut, self._was_cut = mesh, count, True, True
+        self.padded = -(-max(mesh.n_face, 1) // 16) * 16
+        self.stride = self.padded + -(-max(cut_room, 1024) // 16) * 16
+        vectors = -(-(self.stride // 16) // 16) * 16
+        self._views = opencl.Shared(np.zeros(count, VIEW))
+        self._views.array["slots"] = np.arange(count) * self.stride
+        self._counters = opencl.Shared(np.zeros((count, 32), np.int32))
+        self._beside = opencl.Shared(np.zeros((count, len(mesh.bodies)), np.int32))
+        self.views, self.counters = self._views.buffer, self._counters.buffer
+        self.triangles = opencl.allocate(count * self.stride * TRIANGLE_BYTES)
+        self.slots = opencl.allocate(count * self.stride * SLOT_BYTES)
+        self.labels = opencl.allocate(count * self.stride * LABEL_BYTES)
+        self.boxes = opencl.upload(np.full(count * self.stride * 4, LIMIT, np.int32))
+        self.coarse = opencl.upload(np.full(count * vectors * 4, LIMIT, np.int32))
+        crossing = opencl.allocate(count * self.padded)
+        sizes = (np.int32(mesh.n_face), np.int32(self.padded), np.int32(self.stride), np.int32(len(mesh.bodies)))
+        screen = (
+            self.triangles,
+            self.slots,
+            self.labels,
+            self.boxes,
+            self.coarse,
+            crossing,
+            self.counters,
+            self._beside.buffer,
+        )
+        path = "render/rasterize.cl"
+        self.steps = {
+            "triangles": opencl.Call(
+                path, "set_up", (-(-(self.padded // 16) // VECTORS), count), (1, 1),
+                (self.views, mesh.vertices, mesh.faces, mesh.tags, *screen, *sizes),
+            ),
+            "cut triangles": opencl.Call(
+                path, "cut_faces", (count,), (1,), (self.views, mesh.vertices, mesh.faces, mesh.tags, *screen, *sizes)
+            ),
+        }  # fmt: skip
+
+    def aim(self, cameras: Sequence[Camera], *, taken: int, frustum: bool = True, cull: bool = False) -> None:
+        """Set the cameras and put the set-up of all triangles into the queue.
+
+        Args:
+            cameras: `count` of them.
+            taken: layers that the tiles begin with.
+            frustum: whether objects beside a view are left out.
+            cull: whether faces of bodies that are turned away are left out, as long as the eye is outside.
+        """
+        texels, self.may_cut = 0, False
+        for i, (r, camera) in enumerate(zip(self._views.array, cameras, strict=True)):
+            r["eye"], r["axes"] = camera.eye.double().numpy(), camera.axes.double().numpy()
+            r["pixel_size"], r["near"] = camera.pixel_size, camera.near
+            r["width"], r["height"] = camera.width, camera.height
+            r["perspective"] = camera.projection == "perspective"
+            beside, ahead, whole = overlap(camera, self.mesh)
+            outside = bool((ahead | beside | ~self.mesh.bodies).all())
+            r["texels"], r["cull"], r["outside"] = texels, cull and outside, outside
+            # What lies beside is behind the eye as a whole, or needs no cutting: only what is seen can cross.
+            self._beside.array[i] = beside & frustum
+            self.may_cut |= not (whole | (beside & frustum)).all()
+            texels += camera.width * camera.height
+        counters = self._counters.array
+        counters[:] = 0
+        counters[:, COUNTERS.index("used")] = taken
+        counters[:, COUNTERS.index("vectors")] = self.padded // 16
+        for shared in (self._views, self._counters, self._beside):
+            shared.send()
+        self.steps["triangles"]()
+        if self.may_cut or self._was_cut:
+            self.steps["cut triangles"]()
+        self._was_cut = self.may_cut
+
+    def counts(self) -> list[dict[str, int]]:
+        """Wait, and return what each view did."""
+        return [dict(zip(COUNTERS, row, strict=False)) for row in self._counters.receive().tolist()]
+
+    def room_for_cuts(self) -> int:
+        """Return triangles that cut faces may become."""
+        return self.stride - self.padded
+
+
+class DeviceRaster:
+    """All layers of a mesh from one camera, again and again; as many as there are."""
+
+    def __init__(self, mesh: DeviceMesh, width: int, height: int):
+        """Make room for pictures of width x height pixels."""
+        self._mesh, self._size, self._extra, self._cut_room = mesh, (width, height), 4096, 0
+        self._make()
+
+    def _make(self) -> None:
+        width, height = self._size
+        self.views = DeviceViews(self._mesh, 1, cut_room=self._cut_room)
+        self._taken = -(-width // TILE) * -(-height // TILE) * STAMPS * ROOM
+        self._capacity = self._taken + self._extra
+        n_stamp = -(-width // 4) * -(-height // 4)
+        self._begin, self._layers = opencl.allocate(4 * n_stamp), opencl.allocate(4 * n_stamp)
+        self._key, self._slot = (opencl.allocate(64 * self._capacity) for _ in range(2))
+        v = self.views
+        self._fill = opencl.Call(
+            "render/rasterize.cl", "fill_tiles", (opencl.units(),), (1,),
+            (v.views, v.triangles, v.boxes, v.coarse, v.counters, np.int32(v.stride), np.int32(self._capacity),
+             self._begin, self._layers, self._key, self._slot),
+        )  # fmt: skip
+
+    def draw(self, camera: Camera) -> None:
+        """Fill the picture of `camera` and wait for it."""
+        while True:
+            self.views.aim([camera], taken=self._taken)
+            self._fill()
+            count = self.views.counts()[0]
+            if count["used"] <= self._capacity and count["slots"] <= self.views.room_for_cuts():
+                return
+            self._extra = max(self._extra, 2 * (count["used"] - self._taken))
+            self._cut_room = max(self._cut_room, count["slots"])
+            self._make()
+
+    def lists(self, camera: Camera) -> DeviceLists:
+        """Draw, and return the fragments."""
+        self.draw(camera)
+        width, height = self._size
+        across, down = -(-width // 4), -(-height // 4)
+        begin, layers = (opencl.fetch(x, np.zeros(across * down, np.int32)) for x in (self._begin, self._layers))
+        key = opencl.fetch(self._key, np.zeros((self._capacity, 16), np.float32))
+        slot = opencl.fetch(self._slot, np.zeros((self._capacity, 16), np.int32))
+        faces = opencl.fetch(self.views.labels, np.zeros((self.views.stride, LABEL_BYTES // 4), np.int32))[:, 2]
+        stamp = np.repeat(np.arange(across * down), layers)
+        layer = np.arange(len(stamp)) - np.repeat(np.cumsum(layers) - layers, layers)
+        key, slot = key[begin[stamp] + layer], slot[begin[stamp] + layer]
+        lane = np.arange(16)
+        x, y = 4 * (stamp % across)[:, None] + lane % 4, 4 * (stamp // across)[:, None] + lane // 4
+        there = np.isfinite(key) & (x < width) & (y < height)
+        pixel = (y * width + x)[there]
+        order = np.argsort(pixel, kind="stable")
+        pixel, face = torch.from_numpy(pixel[order]), torch.from_numpy(faces[slot[there][order]]).long()
+        q = torch.from_numpy(key[there][order])
+        if camera.projection == "orthographic":
+            return DeviceLists(pixel, face, q)
+        xy = torch.stack([pixel % width, pixel // width], -1) + 0.5
+        return DeviceLists(pixel, face, (-camera.rays(xy.double())[2] / q).float())
