@@ -11,15 +11,15 @@ static INNER void set_up_part(const int part, const int number, __global const V
                               __global Slot *restrict slots, __global Label *restrict labels,
                               __global int *restrict boxes, __global int *restrict coarse,
                               __global uchar *restrict crossing, __global Counters *restrict counters,
-                              __global const int *restrict objects, const int count, const int padded,
-                              const int stride, const int n_object)
+                              __global const Box *restrict objects, const int count, const int padded,
+                              const int stride)
 {
     __global const View *view = views + number;
     __global Counters *counted = counters + number;
     const int coarse_stride = ((stride >> 4) + 15) & ~15;
     __global int *box_of = boxes + 4 * view->slots;
     __global int *coarse_of = coarse + number * 4 * coarse_stride;
-    __global const int *beside_of = objects + number * n_object;
+    int object = -1, place = 0, near_bodies = 0;
     int drawn = 0, degenerate = 0, turned = 0, aside = 0, crossed = 0, behind = 0;
     for (int v = VECTORS * part; v < MIN(VECTORS * (part + 1), padded >> 4); v++) {
         __global Label *label = labels + view->slots + 16 * v;
@@ -46,8 +46,13 @@ static INNER void set_up_part(const int part, const int number, __global const V
         for (int rest = lanes; rest; rest &= rest - 1) {
             const int lane = __builtin_ctz(rest), f = 16 * v + lane;
             const int2 tag = tags[f];
-            beside |= (beside_of[tag.y] != 0) << lane;
-            hidden |= (view->cull && tag.x & CLOSED) << lane;
+            if (tag.y != object) {
+                object = tag.y;
+                place = overlap(view, objects + object);
+                near_bodies |= place & AROUND && objects[object].body;
+            }
+            beside |= (place & BESIDE && view->frustum) << lane;
+            hidden |= (view->cull && tag.x & CLOSED && !(place & AROUND)) << lane;
             label[lane].face = f;
             label[lane].tag = tag.x;
             label[lane].object = tag.y;
@@ -72,6 +77,7 @@ static INNER void set_up_part(const int part, const int number, __global const V
         aside += __builtin_popcount(beside);
         behind += __builtin_popcount(lanes & ~ahead & ~beside);
     }
+    if (near_bodies) counted->near_bodies = 1;
     if (drawn) atomic_add(&counted->drawn, drawn);
     if (degenerate) atomic_add(&counted->degenerate, degenerate);
     if (turned) atomic_add(&counted->turned, turned);
@@ -90,11 +96,10 @@ __kernel void set_up(__global const View *restrict views, __global const double 
                      __global int *restrict coarse,        // (4, slots / 16)
                      __global uchar *restrict crossing,    // (padded faces) per view
                      __global Counters *restrict counters,
-                     __global const int *restrict objects,  // (view, object) whether it lies beside the view
-                     const int count, const int padded, const int stride, const int n_object)
+                     __global const Box *restrict objects, const int count, const int padded, const int stride)
 {
     set_up_part(get_global_id(0), get_global_id(1), views, vertices, faces, tags, triangles, slots, labels, boxes,
-                coarse, crossing, counters, objects, count, padded, stride, n_object);
+                coarse, crossing, counters, objects, count, padded, stride);
 }
 
 typedef struct {
@@ -141,8 +146,7 @@ __kernel void cut_faces(__global const View *restrict views, __global const doub
                         __global Triangle *restrict triangles, __global Slot *restrict slots,
                         __global Label *restrict labels, __global int *restrict boxes, __global int *restrict coarse,
                         __global const uchar *restrict crossing, __global Counters *restrict counters,
-                        __global const int *restrict objects, const int count, const int padded, const int stride,
-                        const int n_object)
+                        const int count, const int padded, const int stride)
 {
     const int number = get_global_id(0);
     __global const View *view = views + number;

@@ -353,7 +353,8 @@ static INNER void draw_tiles(const int worker, __global const View *restrict vie
                              __global int *restrict owner, __global uchar *restrict shadowed,
                              __global int *restrict empty)
 {
-    const Place place = {view, slots, labels, faces, records, facets, tables, mdfs, !view->outside, 1, frame->skips};
+    const Place place = {view, slots, labels, faces, records, facets, tables, mdfs, counters->near_bodies, 1,
+                         frame->skips};
     const Shadows shadows = {light_views, light_slots, light_labels, light_triangles, texels};
     const Target target = {frame, reflectances, lights, shadows, shown, rgba, depth, owner, shadowed};
     const int across = (view->width + TILE - 1) / TILE, down = (view->height + TILE - 1) / TILE;

@@ -86,7 +86,7 @@ static INNER void draw_light_tiles(const int worker, __global const View *restri
     __global Counters *counted = counters + number;
     const int coarse_stride = ((stride >> 4) + 15) >> 4;
     const Place place = {view, slots + view->slots, labels + view->slots, faces, records, facets, tables, mdfs,
-                         !view->outside, 0, skips};
+                         counted->near_bodies, 0, skips};
     const int across = (view->width + TILE - 1) / TILE, down = (view->height + TILE - 1) / TILE;
     Lists lists;
     Tally tally = {0};

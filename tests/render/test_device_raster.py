@@ -1,5 +1,3 @@
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 import torch
@@ -7,8 +5,8 @@ import torch
 from tests.render.test_rasterize import KINDS, camera, scene
 from tests.tolerances import OPENCL_DEPTH
 from torchmeso.geometry import shapes
-from torchmeso.render.device_raster import DeviceRaster, overlap, upload_mesh
-from torchmeso.render.rasterize import GUARD_BAND, rasterize
+from torchmeso.render.device_raster import DeviceRaster, upload_mesh
+from torchmeso.render.rasterize import rasterize
 
 
 def drawn(view, points, faces):
@@ -77,22 +75,32 @@ def test_with_nothing_to_draw(device):
 
 
 @pytest.mark.parametrize("projection", ["perspective", "orthographic"])
-def test_boxes_are_where_all_their_corners_are(projection, rng):
-    """Beside: all corners beyond one side of the view. Ahead, whole: all beyond the near plane, in the guard band."""
-    low, size = rng.normal(size=(400, 3)) * 3, rng.uniform(0.01, 2, (400, 3))
-    mesh = SimpleNamespace(centre=low + size / 2, half=size / 2)
+def test_objects_beside_the_view_and_around_the_eye(projection, device):
+    """A hundred objects at random: those left out have no fragment, and are the ones beyond one side of the view."""
+    rng = np.random.default_rng(5)
     view = camera(projection=projection, distance=1.5)
-    beside, ahead, whole = overlap(view, mesh)
-    which = torch.from_numpy(np.stack(np.meshgrid([0, 1], [0, 1], [0, 1]), -1).reshape(8, 3))
-    at = view.project(torch.from_numpy(low)[:, None] + which * torch.from_numpy(size)[:, None])
-    x, y, w, depth = at.unbind(-1)
+    middle = rng.normal(size=(100, 1, 3)) * 2
+    points = torch.from_numpy((middle + rng.normal(size=(100, 12, 3)) * 0.2).reshape(-1, 3))
+    faces = torch.arange(1200).reshape(-1, 3)
+    owner = torch.arange(400, dtype=torch.int32) // 4
+    raster = DeviceRaster(upload_mesh(points, faces, torch.stack([2 * torch.ones_like(owner), owner], 1)), 64, 64)
+    exact, fast = rasterize(view, points, faces), raster.lists(view)
+    assert torch.equal(exact.pixel, fast.pixel)
+    low, high = (f(points.reshape(100, 12, 3), 1) for f in (torch.amin, torch.amax))
+    which = torch.stack(torch.meshgrid(*[torch.tensor([0, 1])] * 3, indexing="ij"), -1).reshape(8, 3)
+    x, y, w, depth = view.project(low[:, None] + which * (high - low)[:, None]).unbind(-1)
     outside = torch.stack([x < -w, x > (view.width + 1) * w, y < -w, y > (view.height + 1) * w, depth < view.near])
-    assert torch.equal(torch.from_numpy(beside), outside.all(-1).any(0))
-    assert torch.equal(torch.from_numpy(ahead), (depth > view.near).all(-1))
-    room = GUARD_BAND - view.width
-    inside = ((x - w * view.width / 2).abs() < room * w) & ((y - w * view.height / 2).abs() < room * w)
-    assert torch.equal(torch.from_numpy(whole), ((depth > view.near) & inside).all(-1))
-    assert beside.any()
-    assert (~beside).any()
-    assert ahead.any()
-    assert (~ahead).any()
+    beside = outside.all(-1).any(0)
+    count = raster.views.counts()[0]
+    assert 0 < count["beside"] == 4 * int(beside.sum()) < 400
+    assert count["near_bodies"] == (~beside & (depth <= view.near).any(-1)).any()
+
+
+def test_nothing_is_cut_where_nothing_can_cross(device):
+    """The kernel for faces that cross the near plane or the guard band runs only where some may."""
+    mesh = shapes.torus_knot(triangles=2000)
+    raster = DeviceRaster(upload_mesh(mesh.vertices, mesh.faces), 64, 64)
+    for distance, cut in ((9.0, False), (0.9, True)):
+        raster.draw(camera(distance=distance))
+        assert raster.views.may_cut == cut
+        assert (raster.views.counts()[0]["crossing"] > 0) == cut

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchmeso.backends import opencl
@@ -27,14 +27,17 @@ TRIANGLE_BYTES, SLOT_BYTES, LABEL_BYTES, LIMIT = 96, 48, 16, 1 << 30
 
 VIEW = np.dtype(
     [("eye", "f8", 3), ("axes", "f8", (3, 3)), ("pixel_size", "f8"), ("near", "f8")]
-    + [(name, "i4") for name in ("width", "height", "perspective", "slots", "texels", "cull", "outside", "pad")]
+    + [(name, "i4") for name in ("width", "height", "perspective", "slots", "texels", "frustum", "cull", "pad")]
 )
 """A camera as the kernels read it."""
+
+BOX = np.dtype([("centre", "f8", 3), ("reach", "f8", 3), ("body", "i4"), ("pad", "i4", 3)])
+"""The box around an object, and whether some of it is closed."""
 
 COUNTERS = (
     "used", "vectors", "slots", "tile", "crossing", "behind", "degenerate", "drawn", "fragments",
     "deepest", "covered", "intervals", "deep", "carved", "inside", "hidden", "looked", "spared", "empty_tiles",
-    "beside", "turned", "losers", "bounded",
+    "beside", "turned", "losers", "bounded", "near_bodies",
 )  # fmt: skip
 """What the kernels count, in the order of `Counters` in kernels_cl/render/rasterize.clh; padded to 32."""
 
@@ -46,9 +49,9 @@ class DeviceMesh(NamedTuple):
         vertices: (V, 3) float64.
         faces: (F, 3) int32.
         tags: (F, 2) int32: component << 2 | 2 where it is closed; object.
-        centre: (object, 3) float64 middle of the box around each object.
-        half: (object, 3) half its sides.
-        bodies: (object,) whether an object has closed components.
+        objects: (object,) see `BOX`.
+        balls: (object, 4) centre and radius of a ball around each object.
+        ball: centre and radius of one around all.
         n_vertex: V.
         n_face: F.
     """
@@ -56,9 +59,9 @@ class DeviceMesh(NamedTuple):
     vertices: "opencl.Buffer"
     faces: "opencl.Buffer"
     tags: "opencl.Buffer"
-    centre: Float[np.ndarray, "object 3"]
-    half: Float[np.ndarray, "object 3"]
-    bodies: Bool[np.ndarray, "object"]
+    objects: "opencl.Buffer"
+    balls: Float[np.ndarray, "object 4"]
+    ball: tuple[tuple[float, float, float], float]
     n_vertex: int
     n_face: int
 
@@ -93,33 +96,30 @@ def upload_mesh(
         box = torch.stack([p.amin(0), p.amax(0)]) if len(p) else torch.zeros(2, 3, dtype=torch.float64)
         boxes.append(box.numpy())
     low, high = np.stack(boxes, 1)
+    objects = np.zeros(len(boxes), BOX)
+    objects["centre"], objects["reach"], objects["body"] = (low + high) / 2, (high - low) / 2, bodies
+    balls = np.concatenate([objects["centre"], np.linalg.norm(objects["reach"], axis=-1)[:, None]], 1)
+    whole = (low.min(0) + high.max(0)) / 2, float(np.linalg.norm(high.max(0) - low.min(0)) / 2)
     return DeviceMesh(
         opencl.upload(vertices.double().numpy()), opencl.upload(faces.int().numpy()),
-        opencl.upload(tags.int().numpy()), (low + high) / 2, (high - low) / 2, np.array(bodies),
+        opencl.upload(tags.int().numpy()), opencl.upload(objects), balls, (tuple(whole[0].tolist()), whole[1]),
         len(vertices), len(faces),
     )  # fmt: skip
 
 
-def overlap(camera: Camera, mesh: DeviceMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return whether each object's box is beside the view, ahead of the eye, and also within the guard band.
+def _uncut(camera: Camera, mesh: DeviceMesh) -> bool:
+    """Return whether no face can cross the near plane or the guard band; in doubt one can.
 
-    In a few calls of numpy, because it is done for every frame.
+    By one ball and in plain numbers, because it is asked for every frame.
     """
-    perspective = camera.projection == "perspective"
-    # A pixel of room at each side of the view; the guard band is met within any part of the picture.
-    right, top = camera.pixel_size * (camera.width / 2 + 1), camera.pixel_size * (camera.height / 2 + 1)
-    guard = camera.pixel_size * (GUARD_BAND - max(camera.width, camera.height))
-    planes = []
-    for across, up in ((right, top), (guard, guard)):
-        for side in (-1.0, 1.0):
-            planes += [[side, 0.0, -across, 0.0] if perspective else [side, 0.0, 0.0, across]]
-            planes += [[0.0, side, -up, 0.0] if perspective else [0.0, side, 0.0, up]]
-    k = np.array([*planes, [0.0, 0.0, -1.0, -camera.near]])
-    n = k[:, :3] @ camera.axes.double().numpy()
-    middle = n @ (mesh.centre - camera.eye.double().numpy()).T + k[:, 3:]
-    reach = np.abs(n) @ mesh.half.T
-    within = middle > reach
-    return (middle[[0, 1, 2, 3, 8]] < -reach[[0, 1, 2, 3, 8]]).any(0), within[8], within[4:].all(0)
+    x, y, z = mesh.ball[0]
+    radius = mesh.ball[1]
+    ex, ey, ez = camera.eye.tolist()
+    local = [a * (x - ex) + b * (y - ey) + c * (z - ez) for a, b, c in camera.axes.tolist()]
+    near = -local[2] - radius
+    room = (GUARD_BAND - max(camera.width, camera.height)) * camera.pixel_size
+    room *= near if camera.projection == "perspective" else 1.0
+    return near > camera.near and max(abs(local[0]), abs(local[1])) + radius < room
 
 
 class DeviceViews:
@@ -140,7 +140,6 @@ class DeviceViews:
         self._views = opencl.Shared(np.zeros(count, VIEW))
         self._views.array["slots"] = np.arange(count) * self.stride
         self._counters = opencl.Shared(np.zeros((count, 32), np.int32))
-        self._beside = opencl.Shared(np.zeros((count, len(mesh.bodies)), np.int32))
         self.views, self.counters = self._views.buffer, self._counters.buffer
         self.triangles = opencl.allocate(count * self.stride * TRIANGLE_BYTES)
         self.slots = opencl.allocate(count * self.stride * SLOT_BYTES)
@@ -148,7 +147,7 @@ class DeviceViews:
         self.boxes = opencl.upload(np.full(count * self.stride * 4, LIMIT, np.int32))
         self.coarse = opencl.upload(np.full(count * vectors * 4, LIMIT, np.int32))
         crossing = opencl.allocate(count * self.padded)
-        sizes = (np.int32(mesh.n_face), np.int32(self.padded), np.int32(self.stride), np.int32(len(mesh.bodies)))
+        sizes = (np.int32(mesh.n_face), np.int32(self.padded), np.int32(self.stride))
         screen = (
             self.triangles,
             self.slots,
@@ -157,13 +156,12 @@ class DeviceViews:
             self.coarse,
             crossing,
             self.counters,
-            self._beside.buffer,
         )
         path = "render/rasterize.cl"
         self.steps = {
             "triangles": opencl.Call(
                 path, "set_up", (-(-(self.padded // 16) // VECTORS), count), (1, 1),
-                (self.views, mesh.vertices, mesh.faces, mesh.tags, *screen, *sizes),
+                (self.views, mesh.vertices, mesh.faces, mesh.tags, *screen, mesh.objects, *sizes),
             ),
             "cut triangles": opencl.Call(
                 path, "cut_faces", (count,), (1,), (self.views, mesh.vertices, mesh.faces, mesh.tags, *screen, *sizes)
@@ -177,27 +175,23 @@ class DeviceViews:
             cameras: `count` of them.
             taken: layers that the tiles begin with.
             frustum: whether objects beside a view are left out.
-            cull: whether faces of bodies that are turned away are left out, as long as the eye is outside.
+            cull: whether faces of bodies that are turned away are left out, of bodies the eye is outside of.
         """
         texels, self.may_cut = 0, False
-        for i, (r, camera) in enumerate(zip(self._views.array, cameras, strict=True)):
+        for r, camera in zip(self._views.array, cameras, strict=True):
             r["eye"], r["axes"] = camera.eye.double().numpy(), camera.axes.double().numpy()
             r["pixel_size"], r["near"] = camera.pixel_size, camera.near
             r["width"], r["height"] = camera.width, camera.height
             r["perspective"] = camera.projection == "perspective"
-            beside, ahead, whole = overlap(camera, self.mesh)
-            outside = bool((ahead | beside | ~self.mesh.bodies).all())
-            r["texels"], r["cull"], r["outside"] = texels, cull and outside, outside
-            # What lies beside is behind the eye as a whole, or needs no cutting: only what is seen can cross.
-            self._beside.array[i] = beside & frustum
-            self.may_cut |= not (whole | (beside & frustum)).all()
+            r["texels"], r["frustum"], r["cull"] = texels, frustum, cull
+            self.may_cut |= not _uncut(camera, self.mesh)
             texels += camera.width * camera.height
         counters = self._counters.array
         counters[:] = 0
         counters[:, COUNTERS.index("used")] = taken
         counters[:, COUNTERS.index("vectors")] = self.padded // 16
-        for shared in (self._views, self._counters, self._beside):
-            shared.send()
+        self._views.send()
+        self._counters.send()
         self.steps["triangles"]()
         if self.may_cut or self._was_cut:
             self.steps["cut triangles"]()

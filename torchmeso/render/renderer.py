@@ -50,9 +50,10 @@ class Renderer:
         """
         start = time.perf_counter()
         self.options = options or FrameOptions()
-        self._scene, self._world = scene, assemble(scene)
+        self._scene, world = scene, assemble(scene)
+        self._corners = shadow_map.corners_of(world)
         silhouettes = self.options.silhouette != "none"
-        self._device = device.upload(scene, self._world, silhouettes=silhouettes, ambient=scene.ambient > 0)
+        self._device = device.upload(scene, world, silhouettes=silhouettes, ambient=scene.ambient > 0)
         self._skips = self.options.skips
         textured = self._device.textured or not self._skips.plain
         mode = {"none": 0, "paper": 1, "curved": 2}[self.options.silhouette] if textured else 0
@@ -128,8 +129,8 @@ class Renderer:
             return False
         if not isinstance(light, SpotLight):
             return True
-        radius = np.linalg.norm(self._device.mesh.half, axis=-1)
-        way = self._device.mesh.centre - light.position.double().numpy()
+        centre, radius = self._device.mesh.balls[:, :3], self._device.mesh.balls[:, 3]
+        way = centre - light.position.double().numpy()
         distance = np.maximum(np.linalg.norm(way, axis=-1), 1e-30)
         off_axis = np.arccos(np.clip(way @ light.axis.double().numpy() / distance, -1, 1))
         seen_under = np.arcsin(np.minimum(radius / distance, 1))
@@ -175,7 +176,7 @@ class Renderer:
             return False
         if self._maps is not None and self._skips.resting and _same(self._maps.lights, lights):
             return False
-        faces = [shadow_map.cameras(self._world, light, self.options.shadow_map_size) for light in lights]
+        faces = [shadow_map.cameras(self._corners, light, self.options.shadow_map_size) for light in lights]
         sizes = tuple((camera.width, camera.height) for views in faces for camera in views)
         if self._maps is None or self._maps.sizes != sizes:
             self._maps = self._make_maps(sizes)

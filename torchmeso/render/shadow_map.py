@@ -17,6 +17,7 @@ Test: tests/render/test_shadow_map.py
 import math
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -62,7 +63,9 @@ SLOPE_BIAS, STEEPEST = 2.0, 0.03
 
 def build(scene: Scene, world: World, light: Light, *, size: int, silhouette: Silhouette) -> ShadowMap:
     """Return the shadow map of `light`: size x size texels (half of that for each face of a point light)."""
-    return ShadowMap(tuple(_draw(scene, world, camera, silhouette) for camera in cameras(world, light, size)))
+    return ShadowMap(
+        tuple(_draw(scene, world, camera, silhouette) for camera in cameras(corners_of(world), light, size))
+    )
 
 
 def blocked(shadow: ShadowMap, position: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
@@ -118,20 +121,28 @@ def _draw(scene: Scene, world: World, camera: Camera, silhouette: Silhouette) ->
     return ShadowFace(camera, triangle, offset, layers.triangles)
 
 
-def cameras(world: World, light: Light, size: int) -> list[Camera]:
-    """Return the views from a light: one around all of the scene, one along a cone, or six faces of a cube."""
-    corners = world.vertices.double()
+def cameras(corners: Float[np.ndarray, "3 V"], light: Light, size: int) -> list[Camera]:
+    """Return the views from a light: one around all of the scene, one along a cone, or six faces of a cube.
+
+    In numpy, whose calls are short: a light may move in every frame.
+
+    Args:
+        corners: (3, V) float64 vertices of the scene.
+        light: any.
+        size: side of the map in texels; of a face of a cube, half of it.
+    """
     if isinstance(light, DirectionalLight):
         axes = _axes(light.direction)
-        low, high = (axes @ corners.T).aminmax(dim=1)
+        local = axes.numpy() @ corners
+        low, high = local.min(1), local.max(1)
         extent = float((high - low).max()) * (1 + 4 / size) + 1e-9
-        eye = ((low + high) / 2) @ axes + axes[2] * extent
+        eye = torch.from_numpy(((low + high) / 2) @ axes.numpy()) + axes[2] * extent
         return [
             Camera(eye=eye, axes=axes, projection="orthographic", view_height=extent, width=size, height=size,
                    near=extent * 1e-3)
         ]  # fmt: skip
     eye = light.position.double()
-    near = max(1e-4 * float((corners - eye).norm(dim=-1).max()), 1e-9)
+    near = max(1e-4 * float(np.linalg.norm(corners - eye.numpy()[:, None], axis=0).max()), 1e-9)
     if isinstance(light, SpotLight):
         axes = _axes(-light.axis)
         # A texel more on every side, so that the rim of the cone is covered.
@@ -146,6 +157,11 @@ def cameras(world: World, light: Light, size: int) -> list[Camera]:
             back[axis] = sign
             cube.append(Camera(eye=eye, axes=_axes(back), fov_deg=fov, width=side, height=side, near=near))
     return cube
+
+
+def corners_of(world: World) -> Float[np.ndarray, "3 V"]:
+    """Return the vertices as `cameras` takes them."""
+    return np.ascontiguousarray(world.vertices.double().numpy().T)
 
 
 def _axes(back: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
