@@ -58,20 +58,14 @@ static void shade_object(const Place *place, __global const Reflectance *reflect
     const Vector3 towards = {-rays->direction.x, -rays->direction.y, -rays->direction.z};
     const Vector3 wo = to_local(&seen->at, towards);
     const float4 albedo = {reflectance->albedo[0], reflectance->albedo[1], reflectance->albedo[2], 0.0f};
-    LookUp look_up;
+    Footprint view;
+    Taps taps;
+    Weights first;
+    float4 T[16];
     if (reflectance->there) {
-        const Footprint view = footprint(TABLE(Ring, tables, reflectance->view_rings), reflectance->view_count, wo);
-        const Taps taps = bilinear(seen->at.u, seen->at.v, reflectance->height, reflectance->width);
-        for (int k = 0; k < 4; k++) {
-            look_up.view_node[k].vector = view.node[k];
-            look_up.view_share[k].vector = view.weight[k];
-            look_up.texel[k].vector = taps.texel[k];
-            look_up.texel_share[k].vector = taps.weight[k];
-        }
-        for (int b = bits; b; b &= b - 1) {
-            const int l = __builtin_ctz(b);
-            look_up.first[l] = view_weights(tables, reflectance, 0, &look_up, l);
-        }
+        view = footprint(TABLE(Ring, tables, reflectance->view_rings), reflectance->view_count, wo);
+        taps = bilinear(seen->at.u, seen->at.v, reflectance->height, reflectance->width);
+        first = view_weights(tables, reflectance, 0, &view, bits);
     }
     int lit = 0;
 
@@ -111,16 +105,13 @@ static void shade_object(const Place *place, __global const Reflectance *reflect
             continue;
         }
         const Footprint from = footprint(TABLE(Ring, tables, reflectance->light_rings), reflectance->light_count, wi);
-        const Ints light_node[4] = {{from.node[0]}, {from.node[1]}, {from.node[2]}, {from.node[3]}};
-        const Floats light_share[4] = {{from.weight[0]}, {from.weight[1]}, {from.weight[2]}, {from.weight[3]}};
         float16 horizon = wi.z / reflectance->last_cosine;
         horizon = horizon > 1.0f ? 1.0f : horizon;
         const Floats arriving = {falloff * horizon * (1.0f / PI)};
-        fetch_ahead(tables, reflectance, &look_up, light_node, arrives);
+        reflect(tables, reflectance, frame->rank_error, &view, &first, &taps, &from, arrives, T, spared);
         for (int b = arrives; b; b &= b - 1) {
             const int l = __builtin_ctz(b);
-            const float4 T = reflect(tables, reflectance, frame->rank_error, &look_up, light_node, light_share, l, spared);
-            rgb[l] += T * power * arriving.lane[l];
+            rgb[l] += not_negative(T[l]) * power * arriving.lane[l];
         }
     }
 
@@ -130,10 +121,8 @@ static void shade_object(const Place *place, __global const Reflectance *reflect
         for (int b = dark; b; b &= b - 1) rgb[__builtin_ctz(b)] += frame->ambient * albedo;
         return;
     }
-    for (int b = dark; b; b &= b - 1) {
-        const int l = __builtin_ctz(b);
-        rgb[l] += frame->ambient * reflect_ambient(tables, reflectance, &look_up, l);
-    }
+    reflect_ambient(tables, reflectance, &view, &first, &taps, dark, T);
+    for (int b = dark; b; b &= b - 1) rgb[__builtin_ctz(b)] += frame->ambient * not_negative(T[__builtin_ctz(b)]);
 }
 
 // Four colours as they are shown: exposure 0, clipped, sRGB, as data/image.py does; log2 and 2^x are polynomials.
