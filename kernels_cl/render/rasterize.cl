@@ -22,7 +22,8 @@ static INNER void set_up_part(const int part, const int number, __global const V
     int object = -1, place = 0, near_bodies = 0;
     int drawn = 0, degenerate = 0, turned = 0, aside = 0, crossed = 0, behind = 0;
     for (int v = VECTORS * part; v < MIN(VECTORS * (part + 1), padded >> 4); v++) {
-        __global Label *label = labels + view->slots + 16 * v;
+        const int s = view->slots + 16 * v;
+        __global Label *label = labels + s;
         const int lanes = (1 << MIN(16, count - 16 * v)) - 1;
         Corners corners;
         int ahead = 0, safe = lanes, hidden = 0, beside = 0;
@@ -59,8 +60,8 @@ static INNER void set_up_part(const int part, const int number, __global const V
         }
         const int whole = safe & ~beside, crosses = lanes & ahead & ~safe & ~beside;
         Planes planes;
-        const int made = set_up_triangles(view, &corners, whole, hidden, triangles + view->slots + 16 * v, &planes);
-        keep_planes(slots + view->slots + 16 * v, label, made, &planes);
+        const int made = set_up_triangles(view, &corners, whole, hidden, triangles + s, &planes);
+        keep_planes(triangles + s, slots + s, made, &planes);
         for (int rest = planes.front; rest; rest &= rest - 1) label[__builtin_ctz(rest)].tag |= FRONT;
         *(__global uchar16 *)(crossing + number * padded + 16 * v) =
             __builtin_convertvector(from_bits(crosses), uchar16);
@@ -204,7 +205,7 @@ __kernel void cut_faces(__global const View *restrict views, __global const doub
                     for (int j = 0; j < 3; j++) rows[r][j].lane[l] = share[j];
                 }
             }
-            keep_planes(slots + s, labels + s, drawn, &planes);
+            keep_planes(triangles + s, slots + s, drawn, &planes);
             counted->drawn += __builtin_popcount(drawn);
             for (int l = 0; l < fits; l++) {
                 labels[s + l].face = f;

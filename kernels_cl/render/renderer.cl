@@ -334,8 +334,7 @@ static INNER void draw_tiles(const int worker, __global const View *restrict vie
                              __global const uchar *restrict tables, __global const Mdf *restrict mdfs,
                              __global const Reflectance *restrict reflectances, __global const Light *restrict lights,
                              __global const View *restrict light_views, __global const Slot *restrict light_slots,
-                             __global const Label *restrict light_labels,
-                             __global const Triangle *restrict light_triangles, __global const Texel *restrict texels,
+                             __global const Texel *restrict texels,
                              __global const Frame *restrict frame, __global float16 *restrict key,
                              __global int16 *restrict slot, __global uchar4 *restrict shown,
                              __global float4 *restrict rgba, __global float *restrict depth,
@@ -344,7 +343,7 @@ static INNER void draw_tiles(const int worker, __global const View *restrict vie
 {
     const Place place = {view, slots, labels, faces, records, facets, tables, mdfs, counters->near_bodies, 1,
                          frame->skips};
-    const Shadows shadows = {light_views, light_slots, light_labels, light_triangles, texels};
+    const Shadows shadows = {light_views, light_slots, texels};
     const Target target = {frame, reflectances, lights, shadows, shown, rgba, depth, owner, shadowed};
     const int across = (view->width + TILE - 1) / TILE, down = (view->height + TILE - 1) / TILE;
     Lists lists;
@@ -402,8 +401,7 @@ void draw(__global const View *restrict view, __global const Triangle *restrict 
           __global const uchar *restrict tables, __global const Mdf *restrict mdfs,
           __global const Reflectance *restrict reflectances, __global const Light *restrict lights,
           __global const View *restrict light_views, __global const Slot *restrict light_slots,
-          __global const Label *restrict light_labels,
-          __global const Triangle *restrict light_triangles, __global const Texel *restrict texels,
+          __global const Texel *restrict texels,
           __global const Frame *restrict frame,
           __global float16 *restrict key, __global int16 *restrict slot,  // layers of the tiles at work
           __global uchar4 *restrict shown,     // (H, pitch) sRGB, and 255 where an object is seen
@@ -414,6 +412,6 @@ void draw(__global const View *restrict view, __global const Triangle *restrict 
           __global int *restrict empty)        // (tiles) whether a tile already shows the background
 {
     draw_tiles(get_group_id(0), view, triangles, slots, labels, boxes, coarse, counters, faces, records, facets, tables,
-               mdfs, reflectances, lights, light_views, light_slots, light_labels, light_triangles, texels, frame, key,
+               mdfs, reflectances, lights, light_views, light_slots, texels, frame, key,
                slot, shown, rgba, depth, owner, shadowed, empty);
 }

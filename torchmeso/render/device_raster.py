@@ -22,7 +22,7 @@ TILE, STAMPS, ROOM, VECTORS = 64, 256, 4, 8
 """Side of a tile in pixels, its stamps, layers a stamp begins with, and sixteens of faces that a work-item sets up; in
 kernels_cl/render/rasterize.clh."""
 
-TRIANGLE_BYTES, SLOT_BYTES, LABEL_BYTES, LIMIT = 96, 48, 16, 1 << 30
+TRIANGLE_BYTES, SLOT_BYTES, LABEL_BYTES, LIMIT = 96, 64, 16, 1 << 30
 """Sizes of the kernels' structures, and what no box reaches."""
 
 VIEW = np.dtype(

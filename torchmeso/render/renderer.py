@@ -253,9 +253,7 @@ class Renderer:
         frame, empty = opencl.Shared(np.zeros(1, FRAME)), opencl.Shared(np.zeros(tiles, np.int32))
         scene, light = self._device, self._maps
         shadows = (
-            (light.views.views, light.views.slots, light.views.labels, light.views.triangles, light.texels)
-            if light
-            else (views.views, views.slots, views.labels, views.triangles, views.slots)
+            (light.views.views, light.views.slots, light.texels) if light else (views.views, views.slots, views.slots)
         )
         draw = opencl.Call(
             "render/renderer.cl", "draw", (self._workers,), (1,),
