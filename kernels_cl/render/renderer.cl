@@ -221,7 +221,9 @@ static Seen look(const Place *place, const Rays *rays, __global const float16 *k
         at.vector = INFINITY;
         const int thin = thin_lanes(place, rays, candidates & ~found.inside & ~found.single, &found, &s, 1, tally);
         hit &= ~thin;
-        if (thin) hit |= test_silhouette(place, rays, thin, &found, &s, 1, &at, &reach, tally);
+        // How far a ray goes is asked where it is written, or where it decides what is in front.
+        const int verdict = depths ? 0 : thin & ~(found.crowded | found.single);
+        if (thin) hit |= test_silhouette(place, rays, thin, &found, &s, 1, verdict, &at, &reach, tally);
 #endif
         tally->carved += __builtin_popcount(candidates & ~hit);
         tally->inside += __builtin_popcount(hit & found.inside);

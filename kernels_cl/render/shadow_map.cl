@@ -37,7 +37,7 @@ static void block_stamp(const Place *place, const Rays *rays, __global const flo
             hit |= thin & ~close;
             Floats at, reach;
             at.vector = INFINITY;
-            if (close) hit |= test_silhouette(place, rays, close, &found, &s, 0, &at, &reach, tally);
+            if (close) hit |= test_silhouette(place, rays, close, &found, &s, 0, close, &at, &reach, tally);
         }
 #endif
         tally->carved += __builtin_popcount(candidates & ~found.inside & ~hit);
