@@ -219,7 +219,7 @@ static Seen look(const Place *place, const Rays *rays, __global const float16 *k
         Floats reach, at;
         reach.vector = -1.0f;
         at.vector = INFINITY;
-        const int thin = thin_lanes(place, rays, candidates & ~found.inside & ~found.single, &found, &s, 1, tally);
+        const int thin = thin_lanes(place, rays, candidates & ~found.inside & ~found.single, &found, &s, 0, 1, tally);
         hit &= ~thin;
         // How far a ray goes is asked where it is written, or where it decides what is in front.
         const int verdict = depths ? 0 : thin & ~(found.crowded | found.single);
@@ -384,6 +384,13 @@ static INNER void draw_tiles(const int worker, __global const View *restrict vie
             tally.deepest = MAX(tally.deepest, filled);
             for (int k = 0; k < filled; k++)
                 tally.fragments += __builtin_popcount(lanes & to_bits(key_of[k] < INFINITY));
+            // What is seen lies near the first fragment: its shadow is asked for before all else.
+            const int near = lanes & to_bits(key_of[0] < INFINITY);
+            const float16 first = view->perspective ? -rays.stretch / key_of[0] : key_of[0];
+            const Vector3 at = {rays.origin.x + first * rays.direction.x, rays.origin.y + first * rays.direction.y,
+                                rays.origin.z + first * rays.direction.z};
+            for (int i = 0; i < frame->lights; i++)
+                if (lights[i].faces == 1) fetch_shadow_ahead(&shadows, lights[i].first_face, &at, near);
             const Seen seen = look(&place, &rays, key_of, slot + lists.begin[s], filled, lanes, &target, &spared,
                                    &tally);
             draw_stamp(&place, &target, &rays, &seen, &spared);

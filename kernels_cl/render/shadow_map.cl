@@ -27,13 +27,14 @@ static void block_stamp(const Place *place, const Rays *rays, __global const flo
         const int16 closed = found.back.vector >= 0;
         const Ints surface = {closed ? found.back.vector : found.front.vector};
         const float16 t = closed ? found.t_back.vector : found.t_front.vector;
+        const Meeting met = meet(place, rays, hit, surface);
 #if SILHOUETTE != 0
         // First by the facets alone; what they leave open asks for the surface at the back.
-        int thin = thin_lanes(place, rays, hit & ~found.single, &found, 0, 0, tally);
+        int thin = thin_lanes(place, rays, hit & ~found.single, &found, 0, &met, 0, tally);
         hit &= ~thin;
         if (thin) {
             const Surface s = surface_at(place, rays, thin, found.back);
-            const int close = thin_lanes(place, rays, thin, &found, &s, 0, tally);
+            const int close = thin_lanes(place, rays, thin, &found, &s, 0, 0, tally);
             hit |= thin & ~close;
             Floats at, reach;
             at.vector = INFINITY;
@@ -42,7 +43,7 @@ static void block_stamp(const Place *place, const Rays *rays, __global const flo
 #endif
         tally->carved += __builtin_popcount(candidates & ~found.inside & ~hit);
         if (!hit) continue;
-        const float16 lean = magnitude(meet(place, rays, hit, surface).slope), steep = MAX(lean, (float16)STEEPEST);
+        const float16 lean = magnitude(met.slope), steep = MAX(lean, (float16)STEEPEST);
         const float16 texel = place->view->perspective ? size * t : (float16)size;
         const float16 bias = texel * (1.0f + SLOPE_BIAS * root(MAX(1.0f - steep * steep, (float16)0.0f)) / steep);
         float16 base = bias;
@@ -112,10 +113,13 @@ static INNER void draw_light_tiles(const int worker, __global const View *restri
                             &tally);
             }
             if (x + 4 <= view->width && y + 4 <= view->height && view->width % 4 == 0) {
-                Texel row[16] __attribute__((aligned(64)));
-                for (int l = 0; l < 16; l++) row[l].slot = nearest.lane[l], row[l].behind = behind.lane[l];
+                const int16 a = nearest.vector, b = as_int16(behind.vector);
+                const int8 rows[4] = {(int8)(a.s0, b.s0, a.s1, b.s1, a.s2, b.s2, a.s3, b.s3),
+                                      (int8)(a.s4, b.s4, a.s5, b.s5, a.s6, b.s6, a.s7, b.s7),
+                                      (int8)(a.s8, b.s8, a.s9, b.s9, a.sa, b.sa, a.sb, b.sb),
+                                      (int8)(a.sc, b.sc, a.sd, b.sd, a.se, b.se, a.sf, b.sf)};
                 for (int k = 0; k < 4; k++)
-                    *(__global int8 *)(texels + view->texels + (y + k) * view->width + x) = *(const int8 *)(row + 4 * k);
+                    *(__global int8 *)(texels + view->texels + (y + k) * view->width + x) = rows[k];
                 continue;
             }
             for (int rest = lanes; rest; rest &= rest - 1) {
