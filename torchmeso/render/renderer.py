@@ -9,7 +9,7 @@ Kernels: kernels_cl/render/renderer.cl, kernels_cl/render/shadow_map.cl         
 """
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -106,14 +106,17 @@ class Renderer:
             )
         check_memory("render", camera.width * camera.height * 100.0, MEMORY_LIMIT, "render fewer pixels")
         while True:
-            drawn = self._draw_maps(lights)
-            picture = self._draw_picture(camera, lights, outputs)
+            maps, picture = self._room(camera, lights)
+            # The device sets the picture's triangles up while the lights' views are found.
+            picture.views.aim([camera], taken=self._taken, frustum=self._skips.frustum, cull=self._cull)
+            drawn = maps is not None and self._draw_maps(maps, lights)
+            self._draw_picture(picture, lights, outputs)
             counts = picture.views.counts()
-            if self._fits(counts + (self._maps.views.counts() if drawn and self._maps else [])):
+            if self._fits(counts + (maps.views.counts() if drawn and maps else [])):
                 break
         opencl.read(picture.results[:1] if outputs == DISPLAY else picture.results[1:])
         picture.lit = (len(given), reaching)
-        faces = sum(self._maps.faces) if self._maps else 0
+        faces = sum(maps.faces) if maps else 0
         self.counts = _named(counts[0], camera) | {
             "lights left out": len(given) - len(reaching),
             "shadow maps drawn": faces if drawn else 0,
@@ -169,28 +172,37 @@ class Renderer:
             self._lists = opencl.allocate(64 * capacity), opencl.allocate(64 * capacity)
         return self._lists
 
-    def _draw_maps(self, lights: tuple[Light, ...]) -> bool:
-        """Draw the lights' maps, unless they are the same as before."""
-        if not self.options.shadows or not lights:
+    def _room(self, camera: Camera, lights: tuple[Light, ...]) -> "tuple[_Maps | None, _Picture]":
+        """Return where shadow maps and picture are drawn; the same as before where their sizes are."""
+        wanted = ()
+        if self.options.shadows:
+            wanted = tuple(tuple(shadow_map.sizes(light, self.options.shadow_map_size)) for light in lights)
+        if not wanted:
             self._maps = None
+        elif self._maps is None or self._maps.sizes != wanted:
+            self._maps = self._make_maps(wanted)
+        self._light_room = max(self._light_room, len(lights))
+        key = (camera.width, camera.height, self._light_room, wanted)
+        if self._picture is None or self._picture.key != key:
+            self._picture = self._make_picture(key)
+        return self._maps, self._picture
+
+    def _draw_maps(self, maps: "_Maps", lights: tuple[Light, ...]) -> bool:
+        """Draw the lights' maps, unless they are the same as before."""
+        if self._skips.resting and _same(maps.lights, lights):
             return False
-        if self._maps is not None and self._skips.resting and _same(self._maps.lights, lights):
-            return False
-        faces = [shadow_map.cameras(self._corners, light, self.options.shadow_map_size) for light in lights]
-        sizes = tuple((camera.width, camera.height) for views in faces for camera in views)
-        if self._maps is None or self._maps.sizes != sizes:
-            self._maps = self._make_maps(sizes)
-        maps = self._maps
-        maps.lights, maps.faces = lights, [len(views) for views in faces]
-        maps.views.aim([camera for views in faces for camera in views], taken=self._taken, frustum=self._skips.frustum)
+        views = [v for light in lights for v in shadow_map.cameras(self._corners, light, self.options.shadow_map_size)]
+        maps.lights = lights
+        maps.views.aim(views, taken=self._taken, frustum=self._skips.frustum)
         for call in maps.draw:
             call()
         return True
 
-    def _make_maps(self, sizes: tuple[tuple[int, int], ...]) -> "_Maps":
-        views = DeviceViews(self._device.mesh, len(sizes), cut_room=self._cut_room)
+    def _make_maps(self, sizes: tuple[tuple[int, ...], ...]) -> "_Maps":
+        sides = [side for of_light in sizes for side in of_light]
+        views = DeviceViews(self._device.mesh, len(sides), cut_room=self._cut_room)
         # Empty from the start: where layers find no room a tile stays as it was, and the frame is drawn again.
-        texels = opencl.upload(np.full((sum(w * h for w, h in sizes), 2), -1, np.int32))
+        texels = opencl.upload(np.full((sum(side * side for side in sides), 2), -1, np.int32))
         scene, capacity = self._device, np.int32(self._taken + self._extra)
         draw = [
             opencl.Call(
@@ -200,16 +212,14 @@ class Renderer:
                  np.int32(views.stride), capacity, np.int32(self._skip_bits()), *self._layers(), texels),
                 self._defines,
             )
-            for number in range(len(sizes))
+            for number in range(len(sides))
         ]  # fmt: skip
-        return _Maps(views=views, texels=texels, draw=draw, sizes=sizes)
+        faces = [len(of_light) for of_light in sizes]
+        return _Maps(views=views, texels=texels, draw=draw, sizes=sizes, faces=faces)
 
-    def _draw_picture(self, camera: Camera, lights: tuple[Light, ...], outputs: int) -> "_Picture":
-        self._light_room = max(self._light_room, len(lights))
-        key = (camera.width, camera.height, self._light_room, self._maps.sizes if self._maps else None)
-        if self._picture is None or self._picture.key != key:
-            self._picture = self._make_picture(key)
-        picture, scene, maps = self._picture, self._scene, self._maps
+    def _draw_picture(self, picture: "_Picture", lights: tuple[Light, ...], outputs: int) -> None:
+        """Draw the picture of the camera it is aimed with."""
+        scene, maps = self._scene, self._maps
         if picture.shone is not lights:
             records = picture.lights.array
             records[: max(len(lights), 1)] = device.light_records(lights)
@@ -230,9 +240,7 @@ class Renderer:
             picture.empty.array[:] = 0
             picture.empty.send()
             picture.outputs = outputs
-        picture.views.aim([camera], taken=self._taken, frustum=self._skips.frustum, cull=self._cull)
         picture.draw()
-        return picture
 
     def _skip_bits(self) -> int:
         """Return the skips as `SKIP_*` in kernels_cl/render/silhouette.clh."""
@@ -275,9 +283,9 @@ class _Maps:
     views: DeviceViews
     texels: "opencl.Buffer"
     draw: list[opencl.Call]
-    sizes: tuple[tuple[int, int], ...]
+    sizes: tuple[tuple[int, ...], ...]  # sides of the faces of each light
+    faces: list[int]
     lights: tuple[Light, ...] = ()
-    faces: list[int] = field(default_factory=list)
 
 
 @dataclass(eq=False, kw_only=True)

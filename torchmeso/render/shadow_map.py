@@ -121,6 +121,13 @@ def _draw(scene: Scene, world: World, camera: Camera, silhouette: Silhouette) ->
     return ShadowFace(camera, triangle, offset, layers.triangles)
 
 
+def sizes(light: Light, size: int) -> list[int]:
+    """Return the sides in texels of the pictures that `cameras` takes from a light."""
+    if isinstance(light, DirectionalLight | SpotLight):
+        return [size]
+    return [max(size // 2, 1)] * 6
+
+
 def cameras(corners: Float[np.ndarray, "3 V"], light: Light, size: int) -> list[Camera]:
     """Return the views from a light: one around all of the scene, one along a cone, or six faces of a cube.
 
@@ -148,7 +155,7 @@ def cameras(corners: Float[np.ndarray, "3 V"], light: Light, size: int) -> list[
         # A texel more on every side, so that the rim of the cone is covered.
         fov = 2 * math.degrees(math.atan(math.tan(math.radians(light.outer_deg)) * (1 + 4 / size)))
         return [Camera(eye=eye, axes=axes, fov_deg=fov, width=size, height=size, near=near)]
-    side = max(size // 2, 1)
+    side = sizes(light, size)[0]
     fov = 2 * math.degrees(math.atan(1 + 2 / side))
     cube = []
     for axis in range(3):
