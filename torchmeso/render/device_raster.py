@@ -51,7 +51,7 @@ class DeviceMesh(NamedTuple):
         tags: (F, 2) int32: component << 2 | 2 where it is closed; object.
         objects: (object,) see `BOX`.
         balls: (object, 4) centre and radius of a ball around each object.
-        ball: centre and radius of one around all.
+        ball: of one around all.
         n_vertex: V.
         n_face: F.
     """
@@ -61,7 +61,7 @@ class DeviceMesh(NamedTuple):
     tags: "opencl.Buffer"
     objects: "opencl.Buffer"
     balls: Float[np.ndarray, "object 4"]
-    ball: tuple[tuple[float, float, float], float]
+    ball: tuple[float, float, float, float]
     n_vertex: int
     n_face: int
 
@@ -89,22 +89,29 @@ def upload_mesh(
         BackendError: there is no OpenCL device.
     """
     tags = torch.zeros(len(faces), 2, dtype=torch.int32) if tags is None else tags
-    boxes, bodies = [], []
-    for i in range(int(tags[:, 1].max()) + 1 if len(tags) else 1):
-        p = vertices[faces[tags[:, 1] == i].unique()].double()
-        bodies.append(bool((tags[tags[:, 1] == i, 0] & 2).any()))
-        box = torch.stack([p.amin(0), p.amax(0)]) if len(p) else torch.zeros(2, 3, dtype=torch.float64)
-        boxes.append(box.numpy())
-    low, high = np.stack(boxes, 1)
-    objects = np.zeros(len(boxes), BOX)
-    objects["centre"], objects["reach"], objects["body"] = (low + high) / 2, (high - low) / 2, bodies
-    balls = np.concatenate([objects["centre"], np.linalg.norm(objects["reach"], axis=-1)[:, None]], 1)
-    whole = (low.min(0) + high.max(0)) / 2, float(np.linalg.norm(high.max(0) - low.min(0)) / 2)
+    n_object = int(tags[:, 1].max()) + 1 if len(tags) else 1
+    objects, balls = np.zeros(n_object, BOX), np.zeros((n_object, 4))
+    for i in range(n_object):
+        own = tags[:, 1] == i
+        objects["centre"][i], objects["reach"][i], radius = _around(vertices[faces[own].unique()])
+        objects["body"][i] = bool((tags[own, 0] & 2).any())
+        balls[i] = *objects["centre"][i], radius
+    centre, _, radius = _around(vertices[faces.unique()])
     return DeviceMesh(
         opencl.upload(vertices.double().numpy()), opencl.upload(faces.int().numpy()),
-        opencl.upload(tags.int().numpy()), opencl.upload(objects), balls, (tuple(whole[0].tolist()), whole[1]),
+        opencl.upload(tags.int().numpy()), opencl.upload(objects), balls, (*centre.tolist(), radius),
         len(vertices), len(faces),
     )  # fmt: skip
+
+
+def _around(points: Float[Tensor, "n 3"]) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"], float]:
+    """Return the middle of the box around `points`, half its sides, and the distance of the farthest point from there."""
+    if len(points) == 0:
+        return np.zeros(3), np.zeros(3), 0.0
+    p = points.double().numpy()
+    low, high = p.min(0), p.max(0)
+    centre = (low + high) / 2
+    return centre, (high - low) / 2, float(np.linalg.norm(p - centre, axis=-1).max())
 
 
 def _uncut(camera: Camera, mesh: DeviceMesh) -> bool:
@@ -112,8 +119,7 @@ def _uncut(camera: Camera, mesh: DeviceMesh) -> bool:
 
     By one ball and in plain numbers, because it is asked for every frame.
     """
-    x, y, z = mesh.ball[0]
-    radius = mesh.ball[1]
+    x, y, z, radius = mesh.ball
     ex, ey, ez = camera.eye.tolist()
     local = [a * (x - ex) + b * (y - ey) + c * (z - ez) for a, b, c in camera.axes.tolist()]
     near = -local[2] - radius
