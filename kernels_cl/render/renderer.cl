@@ -49,10 +49,38 @@ typedef struct {
     int seen, inside;
 } Seen;
 
+// Directions from positions to a light, and the share of its power that would arrive there.
+static Vector3 toward(__global const Light *light, const Vector3 *position, float16 *falloff)
+{
+    if (light->kind == 0) {
+        const Vector3 wi = {light->place[0], light->place[1], light->place[2]};
+        *falloff = 1.0f;
+        return wi;
+    }
+    const Vector3 way = {light->place[0] - position->x, light->place[1] - position->y, light->place[2] - position->z};
+    const Vector3 wi = normalize3(way);
+    *falloff = 1.0f / MAX(dot3(way, way), (float16)1e-12f);
+    if (light->kind == 2) {
+        const float16 cosine = -(light->axis[0] * wi.x + light->axis[1] * wi.y + light->axis[2] * wi.z);
+        float16 x = (cosine - light->outer) / MAX(light->inner - light->outer, 1e-6f);
+        x = x > 1.0f ? 1.0f : x;
+        x = x > 0.0f ? x : 0.0f;
+        *falloff *= x * x * (3.0f - 2.0f * x);
+    }
+    return wi;
+}
+
+// The lanes of `bits` whose normals lean towards a light: in the others its shadow decides nothing.
+static int facing(__global const Light *light, const Vector3 *normal, const Vector3 *position, const int bits)
+{
+    float16 falloff;
+    return bits & to_bits(dot3(toward(light, position, &falloff), *normal) > 0.0f);
+}
+
 // Radiance of the points of one object in the lanes `bits`, added to `rgb`.
 static void shade_object(const Place *place, __global const Reflectance *reflectance, __global const Light *lights,
                          __global const Frame *frame, const Rays *rays, const Seen *seen, const int bits,
-                         const int *blocked, float4 *rgb, int *spared)
+                         const int *blocked, float4 *rgb, Tally *tally)
 {
     __global const uchar *tables = place->tables;
     const Vector3 towards = {-rays->direction.x, -rays->direction.y, -rays->direction.z};
@@ -71,24 +99,8 @@ static void shade_object(const Place *place, __global const Reflectance *reflect
 
     for (int i = 0; i < frame->lights; i++) {
         __global const Light *light = lights + i;
-        Vector3 wi_world;
-        float16 falloff = 1.0f;
-        if (light->kind == 0) {
-            wi_world.x = light->place[0], wi_world.y = light->place[1], wi_world.z = light->place[2];
-        } else {
-            const Vector3 way = {light->place[0] - seen->position.x, light->place[1] - seen->position.y,
-                                 light->place[2] - seen->position.z};
-            falloff = 1.0f / MAX(dot3(way, way), (float16)1e-12f);
-            wi_world = normalize3(way);
-            if (light->kind == 2) {
-                const float16 cosine = -(light->axis[0] * wi_world.x + light->axis[1] * wi_world.y +
-                                         light->axis[2] * wi_world.z);
-                float16 x = (cosine - light->outer) / MAX(light->inner - light->outer, 1e-6f);
-                x = x > 1.0f ? 1.0f : x;
-                x = x > 0.0f ? x : 0.0f;
-                falloff *= x * x * (3.0f - 2.0f * x);
-            }
-        }
+        float16 falloff;
+        const Vector3 wi_world = toward(light, &seen->position, &falloff);
         const Vector3 wi = to_local(&seen->at, wi_world);
         const float4 power = {light->power[0], light->power[1], light->power[2], 0.0f};
         const float most = MAX(MAX(power.x, power.y), power.z);
@@ -108,7 +120,8 @@ static void shade_object(const Place *place, __global const Reflectance *reflect
         float16 horizon = wi.z / reflectance->last_cosine;
         horizon = horizon > 1.0f ? 1.0f : horizon;
         const Floats arriving = {falloff * horizon * (1.0f / PI)};
-        reflect(tables, reflectance, frame->rank_error, &view, &first, &taps, &from, arrives, T, spared);
+        reflect(tables, reflectance, frame->rank_error, &view, &first, &taps, &from, arrives, T,
+                &tally->spared);
         for (int b = arrives; b; b &= b - 1) {
             const int l = __builtin_ctz(b);
             rgb[l] += not_negative(T[l]) * power * arriving.lane[l];
@@ -154,7 +167,7 @@ static uchar16 encode(const float16 colour)
 }
 
 // Shades what the lanes of a stamp show and writes it.
-static void draw_stamp(const Place *place, const Target *target, const Rays *rays, const Seen *seen, int *spared)
+static void draw_stamp(const Place *place, const Target *target, const Rays *rays, const Seen *seen, Tally *tally)
 {
     __global const Frame *frame = target->frame;
     __global const Light *lights = target->lights;
@@ -168,7 +181,10 @@ static void draw_stamp(const Place *place, const Target *target, const Rays *ray
     const Vector3 receiver = {rays->origin.x + d * rays->direction.x, rays->origin.y + d * rays->direction.y,
                               rays->origin.z + d * rays->direction.z};
     for (int i = 0; i < frame->lights; i++) {
-        blocked[i] = shaded ? blocked_from(&target->shadows, lights[i].first_face, lights[i].faces, &receiver, shaded) : 0;
+        const int asked = place->skips & SKIP_FACING && !(frame->outputs & OWNER)
+                        ? facing(lights + i, &seen->at.n, &seen->position, shaded) : shaded;
+        tally->averted += __builtin_popcount(shaded & ~asked);
+        blocked[i] = asked ? blocked_from(&target->shadows, lights[i].first_face, lights[i].faces, &receiver, asked) : 0;
         if (!(frame->outputs & OWNER)) continue;
         for (int l = 0; l < 16; l++)
             target->shadowed[i * plane + (rays->y + (l >> 2)) * frame->pitch + rays->x + (l & 3)] = blocked[i] >> l & 1;
@@ -176,7 +192,7 @@ static void draw_stamp(const Place *place, const Target *target, const Rays *ray
     for (int rest = shaded; rest;) {
         const int object = seen->object.lane[__builtin_ctz(rest)];
         const int same = rest & to_bits(seen->object.vector == object);
-        shade_object(place, target->reflectances + object, lights, frame, rays, seen, same, blocked, colour, spared);
+        shade_object(place, target->reflectances + object, lights, frame, rays, seen, same, blocked, colour, tally);
         rest &= ~same;
     }
     const Ints objects = {from_bits(seen->inside) ? (int16)-2 : seen->object.vector};
@@ -196,9 +212,9 @@ static void draw_stamp(const Place *place, const Target *target, const Rays *ray
 
 // What the rays of a stamp end on: the nearest of all stretches that stop them.
 static Seen look(const Place *place, const Rays *rays, __global const float16 *key, __global const int16 *slot,
-                 const int filled, const int lanes, const Target *target, int *spared, Tally *tally)
+                 const int filled, const int lanes, const Target *target, Tally *tally)
 {
-    const int depths = target->frame->depths;
+    __global const Frame *frame = target->frame;
     Seen seen;
     seen.depth.vector = INFINITY;
     seen.object.vector = -1;
@@ -215,15 +231,25 @@ static Seen look(const Place *place, const Rays *rays, __global const float16 *k
         int hit = candidates;
         const float16 length = found.t_back.vector - found.t_front.vector;
         const Surface s = surface_at(place, rays, candidates & ~found.inside, found.front);
+        const float16 t = found.t_front.vector;
+        const Vector3 position = {rays->origin.x + t * rays->direction.x, rays->origin.y + t * rays->direction.y,
+                                  rays->origin.z + t * rays->direction.z};
 #if SILHOUETTE != 0
+        // How deep the mesostructure lies is asked where it is written, where a shadow may fall, and where it decides
+        // what is in front.
+        int deep = frame->depths ? candidates : 0;
+        if (place->skips & SKIP_FACING && !(frame->outputs & OWNER)) {
+            deep = 0;
+            for (int i = 0; i < frame->lights && frame->depths && deep != candidates; i++)
+                deep |= facing(target->lights + i, &s.n, &position, candidates & ~deep);
+        }
+        deep |= found.crowded | found.single;
         Floats reach, at;
         reach.vector = -1.0f;
         at.vector = INFINITY;
         const int thin = thin_lanes(place, rays, candidates & ~found.inside & ~found.single, &found, &s, 0, 1, tally);
         hit &= ~thin;
-        // How far a ray goes is asked where it is written, or where it decides what is in front.
-        const int verdict = depths ? 0 : thin & ~(found.crowded | found.single);
-        if (thin) hit |= test_silhouette(place, rays, thin, &found, &s, 1, verdict, &at, &reach, tally);
+        if (thin) hit |= test_silhouette(place, rays, thin, &found, &s, 1, thin & ~deep, &at, &reach, tally);
 #endif
         tally->carved += __builtin_popcount(candidates & ~hit);
         tally->inside += __builtin_popcount(hit & found.inside);
@@ -232,9 +258,7 @@ static Seen look(const Place *place, const Rays *rays, __global const float16 *k
         const int solid = hit & ~found.inside;
         float16 d = 0.0f;
 #if SILHOUETTE != 0
-        // How deep the mesostructure lies is asked where it is written, or where it decides what is in front.
-        int asked = depths ? solid : solid & (found.crowded | found.single);
-        asked &= ~to_bits(reach.vector >= 0.0f);
+        int asked = solid & deep & ~to_bits(reach.vector >= 0.0f);
         const Vector3 towards = {-rays->direction.x, -rays->direction.y, -rays->direction.z};
         const Vector3 wo = to_local(&s, towards);
         int fronts = 0;
@@ -250,14 +274,14 @@ static Seen look(const Place *place, const Rays *rays, __global const float16 *k
             const int same = asked & to_bits(found.object.vector == object);
             asked &= ~same;
             if (!mdf->there) continue;
-            const int deep = same & ~on_plateau(place->tables, mdf, same, s.u, s.v);
-            tally->looked += __builtin_popcount(deep);
-            if (!deep) continue;  // d is 0 already
-            float16 D = s.scale * mdf_distance(place->tables, mdf, deep, s.u, s.v, wo);
+            const int below = same & ~on_plateau(place->tables, mdf, same, s.u, s.v);
+            tally->looked += __builtin_popcount(below);
+            if (!below) continue;  // d is 0 already
+            float16 D = s.scale * mdf_distance(place->tables, mdf, below, s.u, s.v, wo);
             // A ray without a hit ends at the bottom of an open surface's slab.
             const float16 lowest = s.scale * mdf->h / MAX(wo.z, (float16)MIN_COS);
             D = from_bits(found.single) & (D == INFINITY) ? lowest : D;
-            d = from_bits(deep) ? D : d;
+            d = from_bits(below) ? D : d;
         }
 #if SILHOUETTE == 2
         const int16 interval = ~from_bits(found.single) & (reach.vector < 0.0f);
@@ -268,9 +292,6 @@ static Seen look(const Place *place, const Rays *rays, __global const float16 *k
         const float16 depth = found.t_front.vector + d;
         const int16 better = from_bits(hit) & (depth < seen.depth.vector);
         const int bits = to_bits(better);
-        const float16 t = found.t_front.vector;
-        const Vector3 position = {rays->origin.x + t * rays->direction.x, rays->origin.y + t * rays->direction.y,
-                                  rays->origin.z + t * rays->direction.z};
         // What loses, now or to what was found now, is not shaded.
         const int replaced = seen.seen & bits, beaten = hit & ~bits;
         if (place->skips & SKIP_LOSERS) {
@@ -278,9 +299,9 @@ static Seen look(const Place *place, const Rays *rays, __global const float16 *k
         } else {
             Seen loser = seen;
             loser.seen = replaced;
-            if (replaced) draw_stamp(place, target, rays, &loser, spared);
+            if (replaced) draw_stamp(place, target, rays, &loser, tally);
             const Seen other = {s, position, found.object, {depth}, beaten, found.inside & beaten};
-            if (beaten) draw_stamp(place, target, rays, &other, spared);
+            if (beaten) draw_stamp(place, target, rays, &other, tally);
         }
         seen.seen |= bits;
         seen.inside = (seen.inside & ~bits) | (found.inside & bits);
@@ -350,7 +371,7 @@ static INNER void draw_tiles(const int worker, __global const View *restrict vie
     const int across = (view->width + TILE - 1) / TILE, down = (view->height + TILE - 1) / TILE;
     Lists lists;
     Tally tally = {0};
-    int spared = 0, skipped = 0;
+    int skipped = 0;
     const float4 background = {frame->background[0], frame->background[1], frame->background[2], 0.0f};
     const uchar16 shown_background = encode((float16)(background, background, background, background));
     const int plane = frame->pitch * ((view->height + 3) & ~3);
@@ -391,13 +412,11 @@ static INNER void draw_tiles(const int worker, __global const View *restrict vie
                                 rays.origin.z + first * rays.direction.z};
             for (int i = 0; i < frame->lights; i++)
                 if (lights[i].faces == 1) fetch_shadow_ahead(&shadows, lights[i].first_face, &at, near);
-            const Seen seen = look(&place, &rays, key_of, slot + lists.begin[s], filled, lanes, &target, &spared,
-                                   &tally);
-            draw_stamp(&place, &target, &rays, &seen, &spared);
+            const Seen seen = look(&place, &rays, key_of, slot + lists.begin[s], filled, lanes, &target, &tally);
+            draw_stamp(&place, &target, &rays, &seen, &tally);
         }
     }
     count_up(counters, &tally);
-    atomic_add(&counters->spared, spared);
     atomic_add(&counters->empty_tiles, skipped);
 }
 

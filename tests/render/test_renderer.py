@@ -205,6 +205,7 @@ SKIPS = {
     "bounds": ("intervals passed by the facets alone", "paper"),
     "plain": ("frames without silhouette code", "curved"),
     "losers": ("losing fragments not shaded", "curved"),
+    "facing": ("shadow tests of what leans away", "curved"),
     "resting": ("shadow maps kept", "curved"),
     "unlit": ("lights left out", "curved"),
 }
@@ -234,13 +235,15 @@ def test_a_skip_is_wired_and_changes_nothing(name, still_life, device):
     )
     scene = Scene(objects=(*objects, *extra) if name != "plain" else objects, lights=(*LIGHTS["sun"], away))
     view = camera((4.5, 6.0, 10.5), size=256) if name == "empty_tiles" else camera((1.5, 2.0, 3.5), size=160)
-    pictures, counts = [], []
+    pictures, shown, counts = [], [], []
     for on in (True, False):
         options = FrameOptions(silhouette=silhouette, shadow_map_size=128, skips=replace(Skips(), **{name: on}))
         renderer = Renderer(scene, options)
-        renderer.render(view)
-        pictures.append(renderer.render(view))
+        renderer.show(view)
+        shown.append(renderer.show(view).clone())
         counts.append(renderer.counts[counter])
+        pictures.append(renderer.render(view))
+    assert torch.equal(shown[0], shown[1])
     assert torch.equal(pictures[0].rgb, pictures[1].rgb)
     assert torch.equal(pictures[0].owner, pictures[1].owner)
     used, unused = counts

@@ -26,6 +26,7 @@ COUNTERS = {
     "bounds": "intervals passed by the facets alone",
     "plain": "frames without silhouette code",
     "losers": "losing fragments not shaded",
+    "facing": "shadow tests of what leans away",
     "resting": "shadow maps kept",
     "unlit": "lights left out",
 }

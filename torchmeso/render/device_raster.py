@@ -37,7 +37,7 @@ BOX = np.dtype([("centre", "f8", 3), ("reach", "f8", 3), ("body", "i4"), ("pad",
 COUNTERS = (
     "used", "vectors", "slots", "tile", "crossing", "behind", "degenerate", "drawn", "fragments",
     "deepest", "covered", "intervals", "deep", "carved", "inside", "hidden", "looked", "spared", "empty_tiles",
-    "beside", "turned", "losers", "bounded", "near_bodies",
+    "beside", "turned", "losers", "bounded", "near_bodies", "averted",
 )  # fmt: skip
 """What the kernels count, in the order of `Counters` in kernels_cl/render/rasterize.clh; padded to 32."""
 
@@ -105,7 +105,7 @@ def upload_mesh(
 
 
 def _around(points: Float[Tensor, "n 3"]) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"], float]:
-    """Return the middle of the box around `points`, half its sides, and the distance of the farthest point from there."""
+    """Return the middle of the box around `points`, half its sides, and the farthest distance from there."""
     if len(points) == 0:
         return np.zeros(3), np.zeros(3), 0.0
     p = points.double().numpy()

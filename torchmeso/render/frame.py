@@ -37,6 +37,7 @@ class Skips:
         bounds: intervals too long to be passed through ask for no depth.
         plain: without any mesostructure no silhouette code runs.
         losers: only what is seen is shaded.
+        facing: points that lean away from all lights ask a screen for neither depth nor shadow.
         resting: shadow maps stay while light and objects do.
         unlit: lights that reach no object are left out.
     """
@@ -48,6 +49,7 @@ class Skips:
     bounds: bool = True
     plain: bool = True
     losers: bool = True
+    facing: bool = True
     resting: bool = True
     unlit: bool = True
 

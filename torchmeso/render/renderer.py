@@ -245,7 +245,7 @@ class Renderer:
     def _skip_bits(self) -> int:
         """Return the skips as `SKIP_*` in kernels_cl/render/silhouette.clh."""
         s = self._skips
-        return s.empty_tiles | s.behind << 1 | s.bounds << 2 | s.losers << 3
+        return s.empty_tiles | s.behind << 1 | s.bounds << 2 | s.losers << 3 | s.facing << 4
 
     def _make_picture(self, key: tuple) -> "_Picture":
         width, height, n_light, _ = key
@@ -351,4 +351,5 @@ def _named(counts: dict[str, int], camera: Camera) -> dict[str, int]:
         "triangles beside the view": counts["beside"],
         "triangles turned away": counts["turned"],
         "losing fragments not shaded": counts["losers"],
+        "shadow tests of what leans away": counts["averted"],
     }
