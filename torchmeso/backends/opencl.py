@@ -36,14 +36,14 @@ KERNELS = files("kernels_cl")
 
 WIDE = (
     "#pragma clang attribute push(__attribute__((min_vector_width(512))), apply_to = function)\n"
-    "#define HAS_GATHER\n"
+    "#define HAS_AVX512\n"
     '#pragma clang attribute push(__attribute__((target("avx512f,avx512bw,avx512cd,avx512dq,avx512vl"))), '
     "apply_to = function)\n",
     "#pragma clang attribute pop\n#pragma clang attribute pop\n",
 )
 """What is put around a kernel's source where the processor has AVX-512. PoCL builds for what its compiler knows of the
-processor, which for one younger than the compiler is AVX2; vectors of sixteen are then split in two. HAS_GATHER tells
-kernels_cl/common/vector.clh that sixteen places are read by one instruction."""
+processor, which for one younger than the compiler is AVX2; vectors of sixteen are then split in two. HAS_AVX512 tells
+kernels_cl/common/vector.clh of the instructions it may use."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
