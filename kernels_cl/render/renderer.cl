@@ -362,7 +362,7 @@ static INNER void draw_tiles(const int worker, __global const View *restrict vie
                              __global int16 *restrict slot, __global uchar4 *restrict shown,
                              __global float4 *restrict rgba, __global float *restrict depth,
                              __global int *restrict owner, __global uchar *restrict shadowed,
-                             __global int *restrict empty)
+                             __global uchar *restrict empty)
 {
     const Place place = {view, slots, labels, faces, records, facets, tables, mdfs, counters->near_bodies, 1,
                          frame->skips};
@@ -383,17 +383,15 @@ static INNER void draw_tiles(const int worker, __global const View *restrict vie
         if (!fill_tile(view, triangles, boxes, coarse, counters->vectors, frame->stride >> 4, x0, y0, room, &lists, key,
                        slot, &counters->used, frame->capacity))
             continue;  // the host gives more room and asks again
-        int covered = 0;
-        for (int s = 0; s < STAMPS * STAMPS; s++) covered |= lists.filled[s];
-        if (!covered && empty[tile] && frame->skips & SKIP_EMPTY_TILES) {
-            skipped++;
-            continue;
-        }
-        empty[tile] = !covered;
         for (int s = 0; s < STAMPS * STAMPS; s++) {
             const int x = x0 + 4 * (s % STAMPS), y = y0 + 4 * (s / STAMPS);
             if (x >= view->width || y >= view->height) continue;
-            const int filled = lists.filled[s];
+            const int filled = lists.filled[s], at = (y >> 2) * (frame->pitch >> 2) + (x >> 2);
+            if (!filled && empty[at] && frame->skips & SKIP_EMPTY) {
+                skipped++;
+                continue;
+            }
+            empty[at] = !filled;
             if (!filled) {
                 clear_stamp(frame, plane, x, y, background, shown_background, shown, rgba, depth, owner, shadowed);
                 continue;
@@ -408,16 +406,16 @@ static INNER void draw_tiles(const int worker, __global const View *restrict vie
             // What is seen lies near the first fragment: its shadow is asked for before all else.
             const int near = lanes & to_bits(key_of[0] < INFINITY);
             const float16 first = view->perspective ? -rays.stretch / key_of[0] : key_of[0];
-            const Vector3 at = {rays.origin.x + first * rays.direction.x, rays.origin.y + first * rays.direction.y,
-                                rays.origin.z + first * rays.direction.z};
+            const Vector3 nearest = {rays.origin.x + first * rays.direction.x, rays.origin.y + first * rays.direction.y,
+                                     rays.origin.z + first * rays.direction.z};
             for (int i = 0; i < frame->lights; i++)
-                if (lights[i].faces == 1) fetch_shadow_ahead(&shadows, lights[i].first_face, &at, near);
+                if (lights[i].faces == 1) fetch_shadow_ahead(&shadows, lights[i].first_face, &nearest, near);
             const Seen seen = look(&place, &rays, key_of, slot + lists.begin[s], filled, lanes, &target, &tally);
             draw_stamp(&place, &target, &rays, &seen, &tally);
         }
     }
     count_up(counters, &tally);
-    atomic_add(&counters->empty_tiles, skipped);
+    atomic_add(&counters->empty, skipped);
 }
 
 __kernel __attribute__((reqd_work_group_size(1, 1, 1)))
@@ -437,7 +435,7 @@ void draw(__global const View *restrict view, __global const Triangle *restrict 
           __global float *restrict depth,      // (H, pitch)
           __global int *restrict owner,        // (H, pitch)
           __global uchar *restrict shadowed,   // (light, H, pitch)
-          __global int *restrict empty)        // (tiles) whether a tile already shows the background
+          __global uchar *restrict empty)      // (stamps) whether a stamp already shows the background
 {
     draw_tiles(get_group_id(0), view, triangles, slots, labels, boxes, coarse, counters, faces, records, facets, tables,
                mdfs, reflectances, lights, light_views, light_slots, texels, frame, key,

@@ -81,7 +81,7 @@ static INNER void draw_light_tiles(const int worker, __global const View *restri
                                    __global const uchar *restrict tables, __global const Mdf *restrict mdfs,
                                    const int number, const int stride, const int capacity, const int skips,
                                    __global float16 *restrict key, __global int16 *restrict slot,
-                                   __global Texel *restrict texels)
+                                   __global Texel *restrict texels, __global uchar *restrict empty)
 {
     __global const View *view = views + number;
     __global Counters *counted = counters + number;
@@ -102,11 +102,14 @@ static INNER void draw_light_tiles(const int worker, __global const View *restri
         for (int s = 0; s < STAMPS * STAMPS; s++) {
             const int x = x0 + 4 * (s % STAMPS), y = y0 + 4 * (s / STAMPS);
             if (x >= view->width || y >= view->height) continue;
+            const int filled = lists.filled[s], at = (y >> 2) * ((view->width + 3) >> 2) + (x >> 2);
+            if (!filled && empty[at] && skips & SKIP_EMPTY) continue;
+            empty[at] = !filled;
             Ints nearest;
             Floats behind;
             nearest.vector = -1;
             behind.vector = 0.0f;
-            const int filled = lists.filled[s], lanes = to_bits((x + LX < view->width) & (y + LY < view->height));
+            const int lanes = to_bits((x + LX < view->width) & (y + LY < view->height));
             if (filled) {
                 const Rays rays = stamp_rays(view, x, y);
                 block_stamp(&place, &rays, key + lists.begin[s], slot + lists.begin[s], filled, lanes, &nearest, &behind,
@@ -141,8 +144,9 @@ void draw_light(__global const View *restrict views, __global const Triangle *re
                 __global const uchar *restrict tables, __global const Mdf *restrict mdfs, const int number,
                 const int stride, const int capacity, const int skips,
                 __global float16 *restrict key, __global int16 *restrict slot,  // layers of the tiles at work
-                __global Texel *restrict texels)
+                __global Texel *restrict texels,
+                __global uchar *restrict empty)  // (stamps) whether a stamp of the map holds nothing already
 {
     draw_light_tiles(get_group_id(0), views, triangles, slots, labels, boxes, coarse, counters, faces, records, facets,
-                     tables, mdfs, number, stride, capacity, skips, key, slot, texels);
+                     tables, mdfs, number, stride, capacity, skips, key, slot, texels, empty);
 }

@@ -199,7 +199,7 @@ def test_bounds_of_component_groups_hold(device):
 
 SKIPS = {
     "frustum": ("triangles beside the view", "curved"),
-    "empty_tiles": ("tiles that stayed empty", "curved"),
+    "empty": ("stamps that stayed empty", "curved"),
     "hidden": ("triangles turned away", "none"),
     "behind": ("stretches behind a resolved pixel", "curved"),
     "bounds": ("intervals passed by the facets alone", "paper"),
@@ -234,7 +234,7 @@ def test_a_skip_is_wired_and_changes_nothing(name, still_life, device):
         position=torch.tensor([0.0, 5.0, 0.0]), axis=torch.tensor([0.0, 1.0, 0.0]), intensity=torch.full((3,), 50.0)
     )
     scene = Scene(objects=(*objects, *extra) if name != "plain" else objects, lights=(*LIGHTS["sun"], away))
-    view = camera((4.5, 6.0, 10.5), size=256) if name == "empty_tiles" else camera((1.5, 2.0, 3.5), size=160)
+    view = camera((4.5, 6.0, 10.5), size=256) if name == "empty" else camera((1.5, 2.0, 3.5), size=160)
     pictures, shown, counts = [], [], []
     for on in (True, False):
         options = FrameOptions(silhouette=silhouette, shadow_map_size=128, skips=replace(Skips(), **{name: on}))

@@ -20,7 +20,7 @@ from torchmeso.render.scene import Material, Object, Scene
 
 COUNTERS = {
     "frustum": "triangles beside the view",
-    "empty_tiles": "tiles that stayed empty",
+    "empty": "stamps that stayed empty",
     "hidden": "triangles turned away",
     "behind": "stretches behind a resolved pixel",
     "bounds": "intervals passed by the facets alone",

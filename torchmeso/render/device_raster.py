@@ -36,7 +36,7 @@ BOX = np.dtype([("centre", "f8", 3), ("reach", "f8", 3), ("body", "i4"), ("pad",
 
 COUNTERS = (
     "used", "vectors", "slots", "tile", "crossing", "behind", "degenerate", "drawn", "fragments",
-    "deepest", "covered", "intervals", "deep", "carved", "inside", "hidden", "looked", "spared", "empty_tiles",
+    "deepest", "covered", "intervals", "deep", "carved", "inside", "hidden", "looked", "spared", "empty",
     "beside", "turned", "losers", "bounded", "near_bodies", "averted",
 )  # fmt: skip
 """What the kernels count, in the order of `Counters` in kernels_cl/render/rasterize.clh; padded to 32."""

@@ -31,7 +31,7 @@ class Skips:
 
     Attributes:
         frustum: objects that lie beside the view are not set up.
-        empty_tiles: tiles that show the background already are not written again.
+        empty: what shows the background already, 4 x 4 pixels or texels of a map, is not written again.
         hidden: triangles turned away are not drawn where no surface has depth.
         behind: stretches that begin behind what a pixel already shows are not looked at.
         bounds: intervals too long to be passed through ask for no depth.
@@ -43,7 +43,7 @@ class Skips:
     """
 
     frustum: bool = True
-    empty_tiles: bool = True
+    empty: bool = True
     hidden: bool = True
     behind: bool = True
     bounds: bool = True

@@ -21,7 +21,7 @@ from torchmeso.errors import BackendError, check_memory
 from torchmeso.geometry.camera import Camera
 from torchmeso.geometry.light import DirectionalLight, Light, SpotLight
 from torchmeso.render import device, shadow_map
-from torchmeso.render.device_raster import ROOM, STAMPS, TILE, DeviceViews
+from torchmeso.render.device_raster import ROOM, STAMPS, DeviceViews
 from torchmeso.render.film import Picture
 from torchmeso.render.frame import MEMORY_LIMIT, FrameOptions
 from torchmeso.render.scene import Scene, assemble
@@ -209,10 +209,11 @@ class Renderer:
                 "render/shadow_map.cl", "draw_light", (self._workers,), (1,),
                 (views.views, views.triangles, views.slots, views.labels, views.boxes, views.coarse, views.counters,
                  scene.mesh.faces, scene.records, scene.facets, scene.tables, scene.mdfs, np.int32(number),
-                 np.int32(views.stride), capacity, np.int32(self._skip_bits()), *self._layers(), texels),
+                 np.int32(views.stride), capacity, np.int32(self._skip_bits()), *self._layers(), texels,
+                 opencl.upload(np.zeros((-(-side // 4)) ** 2, np.uint8))),
                 self._defines,
             )
-            for number in range(len(sides))
+            for number, side in enumerate(sides)
         ]  # fmt: skip
         faces = [len(of_light) for of_light in sizes]
         return _Maps(views=views, texels=texels, draw=draw, sizes=sizes, faces=faces)
@@ -245,12 +246,11 @@ class Renderer:
     def _skip_bits(self) -> int:
         """Return the skips as `SKIP_*` in kernels_cl/render/silhouette.clh."""
         s = self._skips
-        return s.empty_tiles | s.behind << 1 | s.bounds << 2 | s.losers << 3 | s.facing << 4
+        return s.empty | s.behind << 1 | s.bounds << 2 | s.losers << 3 | s.facing << 4
 
     def _make_picture(self, key: tuple) -> "_Picture":
         width, height, n_light, _ = key
         rows, pitch = -(-height // 4) * 4, -(-width // 4) * 4
-        tiles = -(-width // TILE) * -(-height // TILE)
         rgba, depth = torch.zeros(rows, pitch, 4), torch.zeros(rows, pitch)
         owner = torch.zeros(rows, pitch, dtype=torch.int32)
         shadowed = torch.zeros(max(n_light, 1), rows, pitch, dtype=torch.uint8)
@@ -258,7 +258,7 @@ class Renderer:
         results = [(opencl.buffer(x), x) for x in (shown, rgba, depth, owner, shadowed)]
         views = DeviceViews(self._device.mesh, 1, cut_room=self._cut_room)
         lights = opencl.Shared(np.zeros(max(n_light, 1), device.LIGHT))
-        frame, empty = opencl.Shared(np.zeros(1, FRAME)), opencl.Shared(np.zeros(tiles, np.int32))
+        frame, empty = opencl.Shared(np.zeros(1, FRAME)), opencl.Shared(np.zeros(rows * pitch // 16, np.uint8))
         scene, light = self._device, self._maps
         shadows = (
             (light.views.views, light.views.slots, light.texels) if light else (views.views, views.slots, views.slots)
@@ -346,7 +346,7 @@ def _named(counts: dict[str, int], camera: Camera) -> dict[str, int]:
         "stretches behind a resolved pixel": counts["hidden"],
         "triangles without a pixel": counts["degenerate"],
         "triangles behind the eye": counts["behind"],
-        "tiles that stayed empty": counts["empty_tiles"],
+        "stamps that stayed empty": counts["empty"],
         "groups of components spared": counts["spared"],
         "triangles beside the view": counts["beside"],
         "triangles turned away": counts["turned"],
