@@ -106,8 +106,8 @@ def camera_at(scene: Scene, timed: Timed, coverage: float, *, width: int = 800, 
         camera = timed.config.camera.model_copy(update={"eye": eye, "width": width, "height": height}).build()
         return camera, float(len(raster.lists(camera).pixel.unique())) / (width * height)
 
-    if coverage > 0.99:  # a mesh with holes: close to what lies nearest to the eye
-        vertices = world.vertices.double().numpy()
+    if coverage > 0.99:  # a mesh with holes: close to what lies nearest to the eye on the first object
+        vertices = scene.objects[0].mesh.vertices.double().numpy()
         toward = np.array(timed.eye) / np.linalg.norm(timed.eye)
         at = vertices[np.argmax(vertices @ toward)]
         timed = timed._replace(

@@ -72,7 +72,7 @@ def raster(context: Context) -> Iterator[Row]:
         calls["opencl"] = lambda: device.draw(camera)
     except BackendError as error:
         missing["opencl"] = str(error)
-    timing = time_together(calls, n=15 if context.quick else 41, warm=4, settle=1)
+    timing = time_together(calls, n=15 if context.quick else 41, warm=4, settle=4)
     ours = timing["torch"]
     for name, short, goal in (
         ("llvmpipe 4 peels", "llvmpipe_4peels", 1.3),

@@ -43,7 +43,7 @@ def skip(context: Context) -> Iterator[Row]:
             skips = replace(Skips(), **({off: False} if off else {}))
             renderers[off] = Renderer(scene, replace(options, skips=skips))
             calls[off] = partial(renderers[off].show, camera)
-        timing = time_together(calls, n=9 if context.quick else 25, warm=3, settle=1)
+        timing = time_together(calls, n=9 if context.quick else 25, warm=3, settle=4)
         on = renderers[""].counts
         for f in fields(Skips):
             counter = COUNTERS[f.name]
@@ -68,7 +68,7 @@ def _ranks(context: Context) -> Iterator[Row]:
     errors = (0.0, 0.05, 0.2)
     drawn = {e: Renderer(scene, FrameOptions(shadow_map_size=768, rank_error=e)) for e in errors}
     timing = time_together(
-        {str(e): lambda r=r: r.show(camera) for e, r in drawn.items()}, n=9 if context.quick else 25, warm=3, settle=1
+        {str(e): lambda r=r: r.show(camera) for e, r in drawn.items()}, n=9 if context.quick else 25, warm=3, settle=4
     )
     for e, r in drawn.items():
         picture = r.render(camera)

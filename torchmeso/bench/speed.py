@@ -1,6 +1,6 @@
 """Rows of the suite `render` on time: whole frames beside peers, growth, the first frame, memory.
 
-Frames are what a screen shows, steady: each timed call follows an untimed one, and shadow maps are drawn every time
+Frames are what a screen shows, steady: each timed call follows four untimed ones, and shadow maps are drawn every time
 unless a row says otherwise.
 
 Test: tests/bench/test_speed.py
@@ -72,7 +72,7 @@ def against_embree(context: Context) -> Iterator[Row]:
                 calls |= {"Embree primary": rays.primary, "Embree primary + shadow": rays.both}
             except PeerMissing as error:
                 missing = str(error)
-            timing = time_together(calls, n=9 if context.quick else 25, warm=3, settle=1)
+            timing = time_together(calls, n=9 if context.quick else 25, warm=3, settle=4)
             percent = round(100 * coverage)
             n = len(displaced.faces)
             for silhouette in ("paper", "curved"):
@@ -163,7 +163,7 @@ def against_itself(context: Context) -> Iterator[Row]:
     least = Renderer(bare, FrameOptions(silhouette="none", shadows=False), one_layer=True)
     timing = time_together(
         {"plain": lambda: plain.show(camera), "one layer": lambda: least.show(camera)},
-        n=25 if context.quick else 61, warm=3, settle=1,
+        n=25 if context.quick else 61, warm=3, settle=4,
     )  # fmt: skip
     a, b = timing["plain"], timing["one layer"]
     yield Row(
