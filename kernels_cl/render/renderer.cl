@@ -264,7 +264,7 @@ static Seen look(const Place *place, const Rays *rays, __global const float16 *k
         int fronts = 0;
         for (int rest = asked & found.single; rest; rest &= rest - 1) {
             const int l = __builtin_ctz(rest);
-            if (place->labels[found.front.lane[l]].tag & FRONT) fronts |= 1 << l;
+            if (place->labels[found.front.lane[l]] & FRONT) fronts |= 1 << l;
         }
         asked = (asked & ~found.single) | fronts;
         d = reach.vector >= 0.0f ? reach.vector : 0.0f;
@@ -350,9 +350,9 @@ static void clear_stamp(__global const Frame *frame, const int plane, const int 
 
 static INNER void draw_tiles(const int worker, __global const View *restrict view,
                              __global const Triangle *restrict triangles, __global const Slot *restrict slots,
-                             __global const Label *restrict labels,
+                             __global const int *restrict labels,
                              __global const int16 *restrict boxes, __global const int16 *restrict coarse,
-                             __global Counters *restrict counters, __global const int *restrict faces,
+                             __global Counters *restrict counters,
                              __global const float16 *restrict records, __global const Facet *restrict facets,
                              __global const uchar *restrict tables, __global const Mdf *restrict mdfs,
                              __global const Reflectance *restrict reflectances, __global const Light *restrict lights,
@@ -364,7 +364,7 @@ static INNER void draw_tiles(const int worker, __global const View *restrict vie
                              __global int *restrict owner, __global uchar *restrict shadowed,
                              __global uchar *restrict empty)
 {
-    const Place place = {view, slots, labels, faces, records, facets, tables, mdfs, counters->near_bodies, 1,
+    const Place place = {view, slots, labels, records, facets, tables, mdfs, counters->near_bodies, 1,
                          frame->skips};
     const Shadows shadows = {light_views, light_slots, texels};
     const Target target = {frame, reflectances, lights, shadows, shown, rgba, depth, owner, shadowed};
@@ -420,9 +420,9 @@ static INNER void draw_tiles(const int worker, __global const View *restrict vie
 
 __kernel __attribute__((reqd_work_group_size(1, 1, 1)))
 void draw(__global const View *restrict view, __global const Triangle *restrict triangles,
-          __global const Slot *restrict slots, __global const Label *restrict labels,
+          __global const Slot *restrict slots, __global const int *restrict labels,
           __global const int16 *restrict boxes, __global const int16 *restrict coarse,
-          __global Counters *restrict counters, __global const int *restrict faces,
+          __global Counters *restrict counters,
           __global const float16 *restrict records, __global const Facet *restrict facets,
           __global const uchar *restrict tables, __global const Mdf *restrict mdfs,
           __global const Reflectance *restrict reflectances, __global const Light *restrict lights,
@@ -437,7 +437,7 @@ void draw(__global const View *restrict view, __global const Triangle *restrict 
           __global uchar *restrict shadowed,   // (light, H, pitch)
           __global uchar *restrict empty)      // (stamps) whether a stamp already shows the background
 {
-    draw_tiles(get_group_id(0), view, triangles, slots, labels, boxes, coarse, counters, faces, records, facets, tables,
+    draw_tiles(get_group_id(0), view, triangles, slots, labels, boxes, coarse, counters, records, facets, tables,
                mdfs, reflectances, lights, light_views, light_slots, texels, frame, key,
                slot, shown, rgba, depth, owner, shadowed, empty);
 }

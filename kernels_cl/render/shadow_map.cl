@@ -55,7 +55,7 @@ static void block_stamp(const Place *place, const Rays *rays, __global const flo
             for (int rest = open; rest; rest &= rest - 1) {
                 const int l = __builtin_ctz(rest);
                 __global const Mdf *mdf = place->mdfs + found.object.lane[l];
-                if (mdf->there && place->labels[surface.lane[l]].tag & FRONT) slab.lane[l] = mdf->h;
+                if (mdf->there && place->labels[surface.lane[l]] & FRONT) slab.lane[l] = mdf->h;
             }
             const Surface s = surface_at(place, rays, open, surface);
             const float16 cosine = -dot3(s.n, rays->direction);
@@ -74,9 +74,10 @@ static void block_stamp(const Place *place, const Rays *rays, __global const flo
 }
 
 static INNER void draw_light_tiles(const int worker, __global const View *restrict views,
-                                   __global const Triangle *restrict triangles, __global const Slot *restrict slots, __global const Label *restrict labels,
+                                   __global const Triangle *restrict triangles, __global const Slot *restrict slots,
+                                   __global const int *restrict labels,
                                    __global const int16 *restrict boxes, __global const int16 *restrict coarse,
-                                   __global Counters *restrict counters, __global const int *restrict faces,
+                                   __global Counters *restrict counters,
                                    __global const float16 *restrict records, __global const Facet *restrict facets,
                                    __global const uchar *restrict tables, __global const Mdf *restrict mdfs,
                                    const int number, const int stride, const int capacity, const int skips,
@@ -86,7 +87,7 @@ static INNER void draw_light_tiles(const int worker, __global const View *restri
     __global const View *view = views + number;
     __global Counters *counted = counters + number;
     const int coarse_stride = ((stride >> 4) + 15) >> 4;
-    const Place place = {view, slots + view->slots, labels + view->slots, faces, records, facets, tables, mdfs,
+    const Place place = {view, slots + view->slots, labels + view->slots, records, facets, tables, mdfs,
                          counted->near_bodies, 0, skips};
     const int across = (view->width + TILE - 1) / TILE, down = (view->height + TILE - 1) / TILE;
     Lists lists;
@@ -137,9 +138,9 @@ static INNER void draw_light_tiles(const int worker, __global const View *restri
 
 __kernel __attribute__((reqd_work_group_size(1, 1, 1)))
 void draw_light(__global const View *restrict views, __global const Triangle *restrict triangles,
-                __global const Slot *restrict slots, __global const Label *restrict labels,
+                __global const Slot *restrict slots, __global const int *restrict labels,
                 __global const int16 *restrict boxes, __global const int16 *restrict coarse,
-                __global Counters *restrict counters, __global const int *restrict faces,
+                __global Counters *restrict counters,
                 __global const float16 *restrict records, __global const Facet *restrict facets,
                 __global const uchar *restrict tables, __global const Mdf *restrict mdfs, const int number,
                 const int stride, const int capacity, const int skips,
@@ -147,6 +148,6 @@ void draw_light(__global const View *restrict views, __global const Triangle *re
                 __global Texel *restrict texels,
                 __global uchar *restrict empty)  // (stamps) whether a stamp of the map holds nothing already
 {
-    draw_light_tiles(get_group_id(0), views, triangles, slots, labels, boxes, coarse, counters, faces, records, facets,
+    draw_light_tiles(get_group_id(0), views, triangles, slots, labels, boxes, coarse, counters, records, facets,
                      tables, mdfs, number, stride, capacity, skips, key, slot, texels, empty);
 }

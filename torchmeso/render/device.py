@@ -33,8 +33,11 @@ RECORD = ("n", "t", "uv", "scale", "sign")
 """What a vertex holds, in this order, in sixteen floats."""
 
 FACET = np.dtype(
-    [("normal", "f4", 3), ("turn", "f4"), ("first", "f4", 3), ("scale", "f4"), ("second", "f4", 3), ("pad", "f4")]
+    [(name, "i4") for name in ("tag", "object")]
+    + [(name, "f4") for name in ("turn", "scale")]
+    + [("normal", "f4", 3), ("corner", "i4", 3), ("first", "f4", 3), ("second", "f4", 3)]
 )
+"""A face as kernels read it, in one line of the cache; see `Facet` in kernels_cl/render/silhouette.clh."""
 
 REFLECTANCE = np.dtype(
     [(name, "i4") for name in ("there", "height", "width", "groups", "codes", "light_rings", "light_count")]
@@ -103,7 +106,7 @@ def upload(scene: Scene, world: World, *, silhouettes: bool, ambient: bool) -> D
             )
         reflectances[i], mdfs[i] = shared[id(material)][0][0], shared[id(material)][1][0]
     tags = torch.stack([(world.component << 2) | (world.closed[world.component].long() << 1), world.owner], 1)
-    records, facets, tables = vertex_records(world), face_records(world), pool.joined()
+    records, facets, tables = vertex_records(world), face_records(world, tags), pool.joined()
     return DeviceScene(
         upload_mesh(world.vertices, world.faces, tags),
         opencl.upload(records),
@@ -124,15 +127,16 @@ def vertex_records(world: World) -> Float[np.ndarray, "V 16"]:
     return records
 
 
-def face_records(world: World) -> np.ndarray:
-    """Return the plane of each face, how barycentric coordinates grow along it, and how far normals turn from it."""
+def face_records(world: World, tags: Int[Tensor, "F 2"]) -> np.ndarray:
+    """Return what is asked of each face, see `FACET`; `tags` are those of `upload_mesh`."""
     p, n = world.vertices.double()[world.faces], normalize(world.normals.double())[world.faces]
     e1, e2 = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
     normal = normalize(torch.linalg.cross(e1, e2))
     a, b, c = (e1 * e1).sum(-1), (e1 * e2).sum(-1), (e2 * e2).sum(-1)
     area = (a * c - b * b).clamp(min=1e-30)[:, None]
     facets = np.zeros(len(world.faces), FACET)
-    facets["normal"] = normal.numpy()
+    facets["tag"], facets["object"] = tags.T.numpy()
+    facets["normal"], facets["corner"] = normal.numpy(), world.faces.numpy()
     facets["first"] = ((c[:, None] * e1 - b[:, None] * e2) / area).numpy()
     facets["second"] = ((a[:, None] * e2 - b[:, None] * e1) / area).numpy()
     facets["turn"] = (n - normal[:, None]).norm(dim=-1).amax(1).numpy() + 1e-5

@@ -208,7 +208,7 @@ class Renderer:
             opencl.Call(
                 "render/shadow_map.cl", "draw_light", (self._workers,), (1,),
                 (views.views, views.triangles, views.slots, views.labels, views.boxes, views.coarse, views.counters,
-                 scene.mesh.faces, scene.records, scene.facets, scene.tables, scene.mdfs, np.int32(number),
+                 scene.records, scene.facets, scene.tables, scene.mdfs, np.int32(number),
                  np.int32(views.stride), capacity, np.int32(self._skip_bits()), *self._layers(), texels,
                  opencl.upload(np.zeros((-(-side // 4)) ** 2, np.uint8))),
                 self._defines,
@@ -266,7 +266,7 @@ class Renderer:
         draw = opencl.Call(
             "render/renderer.cl", "draw", (self._workers,), (1,),
             (views.views, views.triangles, views.slots, views.labels, views.boxes, views.coarse, views.counters,
-             scene.mesh.faces, scene.records, scene.facets, scene.tables, scene.mdfs, scene.reflectances,
+             scene.records, scene.facets, scene.tables, scene.mdfs, scene.reflectances,
              lights.buffer, *shadows, frame.buffer, *self._layers(), *(b for b, _ in results), empty.buffer),
             self._defines,
         )  # fmt: skip
