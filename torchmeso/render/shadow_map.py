@@ -173,14 +173,15 @@ def corners_of(world: World) -> Float[np.ndarray, "3 V"]:
 
 def _axes(back: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
     """Return axes of a camera that looks along -`back`, as `frames.around`; in floats, for lights that move."""
-    n = back.tolist()
-    length = math.hypot(*n)
-    n = [x / length for x in n]
+    n = _unit(back.tolist())
     least = min(range(3), key=lambda k: abs(n[k]))
-    t = _cross(n, [float(k == least) for k in range(3)])
-    length = math.hypot(*t)
-    t = [x / length for x in t]
+    t = _unit(_cross(n, [float(k == least) for k in range(3)]))
     return torch.tensor([t, _cross(n, t), n], dtype=torch.float64)
+
+
+def _unit(a: list[float]) -> list[float]:
+    length = math.sqrt(sum(x * x for x in a))
+    return [x / length for x in a]
 
 
 def _cross(a: list[float], b: list[float]) -> list[float]:
