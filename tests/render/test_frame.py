@@ -10,6 +10,7 @@ from torchmeso.geometry.rays import RayScene
 from torchmeso.meso import bake_mdf, generators
 from torchmeso.meso.bake_mdf import MdfOptions
 from torchmeso.render.frame import FrameOptions, render
+from torchmeso.render.scene import in_double
 
 
 def moved(shape, x=0.0, y=0.0, z=0.0):
@@ -101,3 +102,15 @@ def test_absurd_sizes_are_refused():
         FrameOptions(shadow_map_size=1)
     with pytest.raises(SizeError, match="render fewer pixels"):
         render(scene(shapes.plane()), replace(camera((0, 1, 1)), width=16384, height=16384))
+
+
+@pytest.mark.parametrize("silhouette", ["none", "paper", "curved"])
+def test_float64_tells_how_far_float32_is_off(silhouette):
+    mdf = bake_mdf.in_memory(generators.brick(), MdfOptions(texels=32))
+    subject = scene(shapes.torus(triangles=400), shapes.plane(), mdf=mdf, lights=(sun(1, 2, 0),))
+    view, options = camera((0, 2, 3), size=64), FrameOptions(silhouette=silhouette, shadow_map_size=64)
+    rough, exact = render(subject, view, options), render(in_double(subject), view, options)
+    assert exact.rgb.dtype == exact.depth.dtype == torch.float64
+    off = (rough.rgb - exact.rgb).abs().amax(-1)
+    assert ((off > 1 / 255).sum()) <= 2  # decisions on their threshold
+    assert off.median() < 1e-6

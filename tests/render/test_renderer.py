@@ -17,7 +17,7 @@ from torchmeso.meso.bake_mdf import MdfOptions, RayCastMdf
 from torchmeso.render import frame
 from torchmeso.render.frame import FrameOptions, Skips
 from torchmeso.render.renderer import Renderer
-from torchmeso.render.scene import Material, Object, Scene
+from torchmeso.render.scene import Material, Object, Scene, in_double
 
 
 def moved(shape, x=0.0, y=0.0, z=0.0):
@@ -93,6 +93,14 @@ def test_the_same_picture_as_torch(silhouette, light, still_life, device):
         assert exact.counts["fragments"] == fast.counts["fragments"]
         assert exact.counts["layers"] == fast.counts["layers"]
         assert 0 < fast.counts["intervals"] <= exact.counts["intervals"]  # those behind a resolved pixel are skipped
+
+
+def test_the_same_picture_as_torch_in_float64(still_life, device):
+    scene = Scene(objects=still_life, lights=LIGHTS["spot"])
+    view, options = camera((1.5, 2.0, 3.5), size=160), FrameOptions(shadow_map_size=256)
+    exact, fast = frame.render(in_double(scene), view, options), Renderer(scene, options).render(view)
+    assert exact.rgb.dtype == exact.depth.dtype == torch.float64
+    assert ((exact.rgb - fast.rgb).abs().amax(-1) > 1 / 255).double().mean() <= 5e-4
 
 
 @pytest.mark.parametrize("rule", ["add", "paper"])

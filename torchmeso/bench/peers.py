@@ -1,4 +1,6 @@
-"""Other programs on the same triangles, for ratios taken in one run: llvmpipe (OpenGL on the CPU) and Embree.
+"""Other programs on the same triangles, for ratios taken in one run: llvmpipe (OpenGL on the CPU), Embree, Mitsuba.
+
+And torch's own compiler.
 
 Extra `peers`: moderngl and open3d; llvmpipe also needs the Debian packages libegl1 and libgl1-mesa-dri.
 
@@ -7,7 +9,9 @@ Test: tests/bench/test_peers.py
 
 import ctypes.util
 import json
+import logging
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -18,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
@@ -37,6 +42,20 @@ void main() {
   if (gl_FragCoord.z <= texelFetch(nearer, ivec2(gl_FragCoord.xy), 0).r + 1e-7) discard;
   o = vec4(gl_FragCoord.z);
 }"""
+
+
+def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return `function` through torch's compiler; the parts that it cannot compile run eagerly.
+
+    Raises:
+        PeerMissing: there is no C++ compiler.
+    """
+    if shutil.which("c++") is None and shutil.which("g++") is None:
+        raise PeerMissing("torch.compile: no C++ compiler; install g++")
+    for name in ("torch._dynamo", "torch._inductor"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    import_module("torch._dynamo").config.suppress_errors = True
+    return torch.compile(function, dynamic=True)
 
 
 class Llvmpipe:

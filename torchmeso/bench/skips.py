@@ -83,21 +83,35 @@ def _ranks(context: Context) -> Iterator[Row]:
 
 
 def _scenes(context: Context) -> dict[str, tuple[Scene, frames.Timed]]:
-    """The knot; the knot before a plain one, without any mesostructure; many objects, most beside the view; Fig. 13."""
+    """The knot, without any mesostructure, in a coat close around it, and in a crowd; Fig. 13.
+
+    The crowd's other knots stand beside the view, and its other lights shine away.
+    """
     timed = frames.knot()
     knot = frames.build(timed, context.report)
     body = knot.objects[0]
     plain = replace(knot, objects=(Object(mesh=body.mesh, material=Material(btf=body.material.btf)),))
-    away = SpotLight(
-        position=torch.tensor([0.0, 9.0, 0.0]), axis=torch.tensor([0.0, 1.0, 0.0]), intensity=torch.full((3,), 80.0)
+    # So close that many rays pass through its joints on to what it covers.
+    coat = replace(knot, objects=(body, replace(body, mesh=_grown(body.mesh, 0.004))))
+    away = tuple(
+        SpotLight(
+            position=torch.tensor([0.0, 9.0 + i, 0.0]),
+            axis=torch.tensor([0.0, 1.0, 0.0]),
+            intensity=torch.full((3,), 80.0),
+        )
+        for i in range(4)
     )
-    row = tuple(Object(mesh=_moved(body.mesh, 6.0 * i, -2.5 * i), material=body.material) for i in range(-2, 3))
-    crowd = replace(knot, objects=row, lights=(*knot.lights, away))
-    found = {"knot": (knot, timed), "plain": (plain, timed), "crowd": (crowd, timed)}
+    row = tuple(Object(mesh=_moved(body.mesh, 8.0 * i, 2.0 * i), material=body.material) for i in range(-8, 9))
+    crowd = replace(knot, objects=row, lights=(*knot.lights, *away))
+    found = {"knot": (knot, timed), "plain": (plain, timed), "coat": (coat, timed), "crowd": (crowd, timed)}
     if not context.quick:
         fig13 = dict(frames.table_2())["fig13"]
         found["fig13"] = (frames.build(fig13, context.report), fig13)
     return found
+
+
+def _grown(subject: mesh.Mesh, by: float) -> mesh.Mesh:
+    return replace(subject, vertices=subject.vertices + by * subject.normals)
 
 
 def _moved(subject: mesh.Mesh, x: float, z: float) -> mesh.Mesh:

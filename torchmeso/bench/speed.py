@@ -9,6 +9,7 @@ Test: tests/bench/test_speed.py
 import resource
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
@@ -30,7 +31,7 @@ from torchmeso.meso.displace import displace
 from torchmeso.render import frame as torch_frame
 from torchmeso.render.frame import FrameOptions, Skips
 from torchmeso.render.renderer import Renderer
-from torchmeso.render.scene import Material, Object, Scene
+from torchmeso.render.scene import Material, Object, Scene, in_double
 from torchmeso.render.silhouette import Silhouette
 
 MAP = 768
@@ -136,21 +137,37 @@ def against_itself(context: Context) -> Iterator[Row]:
     camera = frames.camera_at(scene, timed, 0.28)
     options = FrameOptions(silhouette="curved", shadow_map_size=MAP)
     fast = renderer(scene, "curved", shadows=True)
-    exact = torch_frame.render(scene, camera, options)
-    timing = time_together(
-        {"torch": lambda: torch_frame.render(scene, camera, options), "opencl": lambda: fast.render(camera)},
-        n=3 if context.quick else 9, warm=1, settle=0,
-    )  # fmt: skip
+    calls: dict[str, Callable[[], object]] = {
+        "torch": lambda: torch_frame.render(scene, camera, options),
+        "opencl": lambda: fast.render(camera),
+    }
+    missing = "left out by --quick: compiling takes minutes" if context.quick else None
+    start = time.perf_counter()
+    try:
+        if missing is None:
+            render = peers.compiled(torch_frame.render)
+            render(scene, camera, options)
+            calls["compiled"] = lambda: render(scene, camera, options)
+    except PeerMissing as error:
+        missing = str(error)
+    compiling = time.perf_counter() - start
+    timing = time_together(calls, n=3 if context.quick else 9, warm=1, settle=0)
     yield ratio(
         "frame.opencl_vs_torch", "curved silhouette, shadows, all outputs, 12k knot: opencl over torch", timing,
         "opencl", "torch", 4.0,
     )  # fmt: skip
+    yield ratio(
+        "frame.opencl_vs_compiled_torch",
+        f"the same frame: opencl over torch.compile, whose first call took {compiling:.0f} s and which falls back to "
+        "eager torch for the parts it cannot compile",
+        timing, "opencl", "compiled", None, missing,
+    )  # fmt: skip
+    exact = torch_frame.render(in_double(scene), camera, options)
     picture = fast.render(camera)
     wrong = (picture.rgb - exact.rgb).abs().amax(-1) > 1 / 255
     yield Row(
         id="frame.opencl_vs_torch.pixels_off",
-        what="pixels of the same frame that differ by more than 1/255 from torch (decisions in float64, shading in "
-        "float32), all causes",
+        what="pixels of the same frame that differ by more than 1/255 from torch in float64, all causes",
         value=round(100 * float(wrong.double().mean()), 5), unit="%", better="lower", goal=0.05,
         peer=f"largest difference elsewhere {float((picture.rgb - exact.rgb).abs().amax(-1)[~wrong].max()):.1e}",
     )  # fmt: skip

@@ -89,7 +89,7 @@ class Meeting(NamedTuple):
 def end(world: World, camera: Camera, layers: Layers, fragment: Int[Tensor, "n"], *, front: bool) -> End:
     """Return the ends of intervals at the fronts or backs `fragment`."""
     points = interpolate(world, layers, camera, fragment)
-    direction = rays(camera, layers.pixel[fragment])[1]
+    direction = rays(camera, layers.pixel[fragment], layers.t.dtype)[1]
     local = frames.to_local(points.frame, direction)
     turn = -1.0 if front else 1.0
 

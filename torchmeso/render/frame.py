@@ -121,8 +121,9 @@ def _develop(
 ) -> dict[str, Tensor]:
     """Shade what is seen and lay it out as a picture."""
     n_pixel = camera.width * camera.height
-    rgb = torch.tensor(scene.background).repeat(n_pixel, 1)
-    depth, owner = torch.full((n_pixel,), torch.inf), torch.full((n_pixel,), -1)
+    dtype = layers.t.dtype
+    rgb = torch.tensor(scene.background, dtype=dtype).repeat(n_pixel, 1)
+    depth, owner = torch.full((n_pixel,), torch.inf, dtype=dtype), torch.full((n_pixel,), -1)
     shadowed = torch.zeros(len(scene.lights), n_pixel, dtype=torch.bool)
     depth[seen.pixel] = seen.depth
 
@@ -132,7 +133,7 @@ def _develop(
     pixel, fragment = seen.pixel[outside], seen.fragment[outside]
     points = interpolate(world, layers, camera, fragment)
     owner[pixel] = points.owner
-    origin, direction, _ = rays(camera, pixel)
+    origin, direction, _ = rays(camera, pixel, dtype)
     receiver = origin + seen.depth[outside, None] * direction
     dark = torch.zeros(len(scene.lights), len(pixel), dtype=torch.bool)
     for l, shadow in enumerate(maps):

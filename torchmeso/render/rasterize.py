@@ -56,7 +56,7 @@ class Layers(NamedTuple):
         start: (height * width + 1,) first fragment of each pixel.
         pixel: (N,) row * width + column.
         triangle: (N,) row of `triangles`.
-        t: (N,) float32 distance along the pixel's ray.
+        t: (N,) distance along the pixel's ray, as precise as the vertices are given.
         triangles: the triangles that were drawn.
     """
 
@@ -75,7 +75,7 @@ def rasterize(camera: Camera, vertices: Float[Tensor, "V 3"], faces: Int[Tensor,
         vertices: (V, 3) world.
         faces: (F, 3).
     """
-    return _fill(camera, set_up(camera, vertices, faces))
+    return _fill(camera, set_up(camera, vertices, faces), vertices.dtype)
 
 
 def barycentric(layers: Layers, camera: Camera, which: Int[Tensor, "n"]) -> Float[Tensor, "n 3"]:
@@ -92,7 +92,7 @@ def barycentric(layers: Layers, camera: Camera, which: Int[Tensor, "n"]) -> Floa
     share = share / share.sum(-1, keepdim=True).clamp(min=1e-300)
     if tri.corner is not None:
         share = (share.unsqueeze(-1) * tri.corner[k]).sum(1)
-    return share.float()
+    return share.to(layers.t.dtype)
 
 
 def depth_at(
@@ -111,8 +111,8 @@ def depth_at(
     q = (share * q_corner).sum(1) * turn * (SUBPIXELS**2 / triangles.area[which])
     q = q.clamp(min=q_corner.amin(1), max=q_corner.amax(1))
     if camera.projection == "orthographic":
-        return q.float()
-    return (camera.rays(xy.double())[2] / q).float()
+        return q.to(xy.dtype)
+    return (camera.rays(xy.double())[2] / q).to(xy.dtype)
 
 
 def set_up(camera: Camera, vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Triangles:
@@ -173,7 +173,7 @@ def _area(xy: Tensor) -> Tensor:
     return (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
 
 
-def _fill(camera: Camera, tri: Triangles) -> Layers:
+def _fill(camera: Camera, tri: Triangles, dtype: torch.dtype) -> Layers:
     """Walk triangles -> rows -> spans -> fragments and sort."""
     spans = _spans(camera, tri)
 
@@ -182,10 +182,14 @@ def _fill(camera: Camera, tri: Triangles) -> Layers:
     step = torch.arange(len(span)) - spans.first.index_select(0, span)
     pixel = spans.pixel.index_select(0, span) + step
     q = spans.q.index_select(0, span) + spans.slope.index_select(0, span) * step
-    t = (_stretch(camera, spans, span, step) / q if camera.projection == "perspective" else q).float()
+    t = (_stretch(camera, spans, span, step) / q if camera.projection == "perspective" else q).to(dtype)
 
     # Pixel first, then depth: positive floats are ordered like their bits. Stable: ties keep the triangles' order.
-    order = torch.sort((pixel << 32) | t.view(torch.int32), stable=True).indices
+    if dtype == torch.float32:
+        order = torch.sort((pixel << 32) | t.view(torch.int32), stable=True).indices
+    else:
+        order = torch.argsort(t, stable=True)
+        order = order[torch.argsort(pixel[order], stable=True)]
     pixel = pixel.index_select(0, order)
     n_pixel = camera.height * camera.width
     start = torch.zeros(n_pixel + 1, dtype=torch.long)

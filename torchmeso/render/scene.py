@@ -3,8 +3,8 @@
 Test: tests/render/test_scene.py
 """
 
-from dataclasses import dataclass
-from typing import NamedTuple, Protocol, runtime_checkable
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -98,6 +98,24 @@ class Scene:
             raise ConfigError(f"scene.ambient_rule: expected 'add' or 'paper', got '{self.ambient_rule}'")
 
 
+def in_double(scene: Scene) -> Scene:
+    """Return `scene` in float64: torch renders as precisely as meshes are given, and others are held against this.
+
+    Codes of tables stay as they are. Kernels read float32 and show the same picture.
+    """
+    return _in_double(scene)
+
+
+def _in_double(x: Any) -> Any:
+    if isinstance(x, Tensor):
+        return x.double() if x.is_floating_point() else x
+    if isinstance(x, tuple):
+        return type(x)(*map(_in_double, x)) if hasattr(x, "_fields") else tuple(map(_in_double, x))
+    if is_dataclass(x) and not isinstance(x, type):
+        return replace(x, **{f.name: _in_double(getattr(x, f.name)) for f in fields(x) if f.init})
+    return x
+
+
 class World(NamedTuple):
     """All meshes of a scene as one.
 
@@ -179,15 +197,15 @@ def interpolate(world: World, layers: Layers, camera: Camera, which: Int[Tensor,
     def mean(values: Tensor) -> Tensor:
         return (values[corner] * weight).sum(1)
 
-    origin, direction, _ = rays(camera, layers.pixel[which])
+    origin, direction, _ = rays(camera, layers.pixel[which], layers.t.dtype)
     position = origin + layers.t[which, None] * direction
     frame = frames.orthonormal(mean(world.normals), mean(world.tangents), world.sign[corner[:, 0]])
     return Points(position, mean(world.uv), frame, mean(world.scale[:, None])[:, 0], world.owner[face])
 
 
 def rays(
-    camera: Camera, pixel: Int[Tensor, "n"]
+    camera: Camera, pixel: Int[Tensor, "n"], dtype: torch.dtype
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"], Float[Tensor, "n"]]:
     """Return origin, unit direction and stretch of the rays through the centres of `pixel`."""
-    xy = torch.stack([pixel % camera.width, pixel // camera.width], -1).float() + 0.5
+    xy = torch.stack([pixel % camera.width, pixel // camera.width], -1).to(dtype) + 0.5
     return camera.rays(xy)

@@ -98,7 +98,7 @@ def _draw(scene: Scene, world: World, camera: Camera, silhouette: Silhouette) ->
     closed = candidates.back >= 0
     surface = torch.where(closed, candidates.back, candidates.fragment)
     points = interpolate(world, layers, camera, surface)
-    direction = rays(camera, candidates.pixel)[1]
+    direction = rays(camera, candidates.pixel, layers.t.dtype)[1]
     cosine = dot(points.frame.n, -direction)
     corner = world.vertices[world.faces[layers.triangles.face[layers.triangle[surface]]]]
     facet = normalize(torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]))
@@ -109,13 +109,14 @@ def _draw(scene: Scene, world: World, camera: Camera, silhouette: Silhouette) ->
 
     # Closed: a little before the back, so that the far side of a body is in its own shadow, but not before the middle.
     inside = -torch.minimum(bias, (t - candidates.t) / 2)
-    h = torch.tensor([0.0 if o.material.mdf is None else o.material.mdf.h for o in scene.objects])[points.owner]
+    slabs = [0.0 if o.material.mdf is None else o.material.mdf.h for o in scene.objects]
+    h = torch.tensor(slabs, dtype=t.dtype)[points.owner]
     textured = layers.triangles.front[layers.triangle[surface]] & (silhouette != "none")
     slab = torch.where(textured, points.scale * h / cosine.clamp(min=MIN_COS), 0)
     behind = torch.where(closed, inside, slab + bias)
     first = nearest(candidates, t + behind)
     n_pixel = camera.width * camera.height
-    triangle, offset = torch.full((n_pixel,), -1), torch.zeros(n_pixel)
+    triangle, offset = torch.full((n_pixel,), -1), torch.zeros(n_pixel, dtype=behind.dtype)
     triangle[candidates.pixel[first]] = layers.triangle[surface[first]]
     offset[candidates.pixel[first]] = behind[first]
     return ShadowFace(camera, triangle, offset, layers.triangles)

@@ -138,7 +138,7 @@ def find_candidates(
         found, single = _opaque(scene, world, layers, found, single, silhouette)
     has_front, has_back = found.front >= 0, found.back >= 0
     t_front = torch.where(has_front, layers.t[found.front.clamp(min=0)] if len(layers.t) else 0, 0.0)
-    near = camera.near * rays(camera, found.pixel)[2]
+    near = camera.near * rays(camera, found.pixel, layers.t.dtype)[2]
     t_front = torch.where(has_front, t_front, near)
     t_back = torch.where(has_back, layers.t[found.back.clamp(min=0)] if len(layers.t) else 0, torch.inf)
     ends = _Ends(scene, world, camera, layers, found, t_front, t_back, depths)
@@ -313,5 +313,5 @@ class _Look(NamedTuple):
 def _look(ends: _Ends, fragment: Tensor, *, towards: bool) -> _Look:
     """Return the points at `fragment`, looked at from the eye (`towards`) or from behind."""
     points = interpolate(ends.world, ends.layers, ends.camera, fragment)
-    direction = rays(ends.camera, ends.layers.pixel[fragment])[1]
+    direction = rays(ends.camera, ends.layers.pixel[fragment], ends.layers.t.dtype)[1]
     return _Look(ends.scene, points, frames.to_local(points.frame, -direction if towards else direction))
