@@ -24,11 +24,33 @@ static INNER void set_up_part(const int part, const int number, __global const V
     for (int v = VECTORS * part; v < MIN(VECTORS * (part + 1), padded >> 4); v++) {
         const int s = view->slots + 16 * v;
         const int lanes = (1 << MIN(16, count - 16 * v)) - 1;
+        int hidden = 0, beside = 0;
+        for (int rest = lanes; rest; rest &= rest - 1) {
+            const int lane = __builtin_ctz(rest);
+            const int2 tag = tags[16 * v + lane];
+            if (tag.y != object) {
+                object = tag.y;
+                place = overlap(view, objects + object);
+                near_bodies |= place & AROUND && objects[object].body;
+            }
+            beside |= (place & BESIDE && view->frustum) << lane;
+            hidden |= (view->cull && tag.x & CLOSED && !(place & AROUND)) << lane;
+        }
+        aside += __builtin_popcount(beside);
+        const int asked = lanes & ~beside;
+        if (!asked) {
+            *(__global uchar16 *)(crossing + number * padded + 16 * v) = 0;
+            for (int k = 0; k < 4; k++) {
+                *(__global int16 *)(box_of + k * stride + 16 * v) = LIMIT;
+                coarse_of[k * coarse_stride + v] = LIMIT;
+            }
+            continue;
+        }
         Corners corners;
-        int ahead = 0, safe = lanes, hidden = 0, beside = 0;
+        int ahead = 0, whole = asked;
         for (int k = 0; k < 3; k++) {
             Doubles point[3] = {{0.0}, {0.0}, {0.0}};
-            for (int rest = lanes; rest; rest &= rest - 1) {
+            for (int rest = asked; rest; rest &= rest - 1) {
                 const int lane = __builtin_ctz(rest);
                 __global const double *p = vertices + 3 * faces[3 * (16 * v + lane) + k];
                 point[0].lane[lane] = p[0], point[1].lane[lane] = p[1], point[2].lane[lane] = p[2];
@@ -41,20 +63,9 @@ static INNER void set_up_part(const int part, const int number, __global const V
             corners.y[k].vector = within ? snap(y) : (int16)0;
             corners.q[k].vector = view->perspective ? 1.0 / p.w.vector : p.depth.vector;
             ahead |= before;
-            safe &= before & to_bits(within);
+            whole &= before & to_bits(within);
         }
-        for (int rest = lanes; rest; rest &= rest - 1) {
-            const int lane = __builtin_ctz(rest), f = 16 * v + lane;
-            const int2 tag = tags[f];
-            if (tag.y != object) {
-                object = tag.y;
-                place = overlap(view, objects + object);
-                near_bodies |= place & AROUND && objects[object].body;
-            }
-            beside |= (place & BESIDE && view->frustum) << lane;
-            hidden |= (view->cull && tag.x & CLOSED && !(place & AROUND)) << lane;
-        }
-        const int whole = safe & ~beside, crosses = lanes & ahead & ~safe & ~beside;
+        const int crosses = asked & ahead & ~whole;
         Planes planes;
         const int made = set_up_triangles(view, &corners, whole, hidden, triangles + s, &planes);
         keep_planes(triangles + s, slots + s, made, &planes);
@@ -72,8 +83,7 @@ static INNER void set_up_part(const int part, const int number, __global const V
         degenerate += __builtin_popcount(whole & ~made & ~planes.turned);
         turned += __builtin_popcount(planes.turned);
         crossed += __builtin_popcount(crosses);
-        aside += __builtin_popcount(beside);
-        behind += __builtin_popcount(lanes & ~ahead & ~beside);
+        behind += __builtin_popcount(asked & ~ahead);
     }
     if (near_bodies) counted->near_bodies = 1;
     if (drawn) atomic_add(&counted->drawn, drawn);
