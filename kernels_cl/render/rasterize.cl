@@ -58,7 +58,8 @@ static INNER void set_up_part(const int part, const int number, __global const V
             const Projected p = project(view, point);
             const double16 x = p.x.vector / p.w.vector, y = p.y.vector / p.w.vector;
             const int before = to_bits(TO_INT(p.depth.vector >= view->near));
-            const int16 within = TO_INT((x <= GUARD_BAND) & (x >= -GUARD_BAND) & (y <= GUARD_BAND) & (y >= -GUARD_BAND));
+            const int16 within = TO_INT((x <= GUARD_BAND) & (x >= -GUARD_BAND) &
+                                        (y <= GUARD_BAND) & (y >= -GUARD_BAND));
             corners.x[k].vector = within ? snap(x) : (int16)0;
             corners.y[k].vector = within ? snap(y) : (int16)0;
             corners.q[k].vector = view->perspective ? 1.0 / p.w.vector : p.depth.vector;

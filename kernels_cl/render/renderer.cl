@@ -184,14 +184,15 @@ static void draw_stamp(const Place *place, const Target *target, const Rays *ray
         const int asked = place->skips & SKIP_FACING && !(frame->outputs & OWNER)
                         ? facing(lights + i, &seen->at.n, &seen->position, shaded) : shaded;
         tally->averted += __builtin_popcount(shaded & ~asked);
-        blocked[i] = asked ? blocked_from(&target->shadows, lights[i].first_face, lights[i].faces, &receiver, asked) : 0;
+        const int first = lights[i].first_face, count = lights[i].faces;
+        blocked[i] = asked ? blocked_from(&target->shadows, first, count, &receiver, asked) : 0;
         if (!(frame->outputs & OWNER)) continue;
         for (int l = 0; l < 16; l++)
             target->shadowed[i * plane + (rays->y + (l >> 2)) * frame->pitch + rays->x + (l & 3)] = blocked[i] >> l & 1;
     }
     for (int rest = shaded; rest;) {
-        const int object = seen->object.lane[__builtin_ctz(rest)];
-        const int same = rest & to_bits(seen->object.vector == object);
+        int object;
+        const int same = of_one_object(&seen->object, rest, &object);
         shade_object(place, target->reflectances + object, lights, frame, rays, seen, same, blocked, colour, tally);
         rest &= ~same;
     }
@@ -269,9 +270,9 @@ static Seen look(const Place *place, const Rays *rays, __global const float16 *k
         asked = (asked & ~found.single) | fronts;
         d = reach.vector >= 0.0f ? reach.vector : 0.0f;
         while (asked) {
-            const int object = found.object.lane[__builtin_ctz(asked)];
+            int object;
+            const int same = of_one_object(&found.object, asked, &object);
             __global const Mdf *mdf = place->mdfs + object;
-            const int same = asked & to_bits(found.object.vector == object);
             asked &= ~same;
             if (!mdf->there) continue;
             const int below = same & ~on_plateau(place->tables, mdf, same, s.u, s.v);

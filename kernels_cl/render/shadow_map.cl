@@ -18,8 +18,8 @@ static void block_stamp(const Place *place, const Rays *rays, __global const flo
     int active = lanes, first_round = 1;
     while (active) {
         Stretches found;
-        const int candidates = next_stretches(place, rays, key, slot, filled, &active, &next, &start, first_round, &found,
-                                              tally);
+        const int candidates = next_stretches(place, rays, key, slot, filled, &active, &next, &start, first_round,
+                                              &found, tally);
         first_round = 0;
         if (!candidates) break;
         // A light inside a solid lights that solid's surroundings; what nothing closes is taken at its front.
@@ -97,8 +97,9 @@ static INNER void draw_light_tiles(const int worker, __global const View *restri
         if (tile >= across * down) break;
         const int x0 = tile % across * TILE, y0 = tile / across * TILE;
         const int room = worker * ROOM * STAMPS * STAMPS;
-        if (!fill_tile(view, triangles + view->slots, boxes + 4 * (view->slots >> 4), coarse + number * 4 * coarse_stride,
-                       counted->vectors, stride >> 4, x0, y0, room, &lists, key, slot, &counted->used, capacity))
+        if (!fill_tile(view, triangles + view->slots, boxes + 4 * (view->slots >> 4),
+                       coarse + number * 4 * coarse_stride, counted->vectors, stride >> 4, x0, y0, room, &lists, key,
+                       slot, &counted->used, capacity))
             continue;  // the host gives more room and asks again
         for (int s = 0; s < STAMPS * STAMPS; s++) {
             const int x = x0 + 4 * (s % STAMPS), y = y0 + 4 * (s / STAMPS);
@@ -113,8 +114,8 @@ static INNER void draw_light_tiles(const int worker, __global const View *restri
             const int lanes = to_bits((x + LX < view->width) & (y + LY < view->height));
             if (filled) {
                 const Rays rays = stamp_rays(view, x, y);
-                block_stamp(&place, &rays, key + lists.begin[s], slot + lists.begin[s], filled, lanes, &nearest, &behind,
-                            &tally);
+                block_stamp(&place, &rays, key + lists.begin[s], slot + lists.begin[s], filled, lanes, &nearest,
+                            &behind, &tally);
             }
             if (x + 4 <= view->width && y + 4 <= view->height && view->width % 4 == 0) {
                 const int16 a = nearest.vector, b = as_int16(behind.vector);
