@@ -56,7 +56,7 @@ def against_embree(context: Context) -> Iterator[Row]:
     scene = frames.build(timed, context.report)
     light = scene.lights[0]
     assert isinstance(light, DirectionalLight)
-    displaced = displace(scene.objects[0].mesh, generators.brick(), max_edge=1.0)
+    displaced = displace(scene.objects[0].mesh, generators.brick())
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
