@@ -1,6 +1,8 @@
+import gc
 import json
 
 import pytest
+import torch
 
 from torchmeso.bench import suite
 from torchmeso.bench.suite import Context, Measurement, Row
@@ -76,3 +78,18 @@ def test_device_has_probes():
 def test_unknown_rows():
     with pytest.raises(ConfigError, match="no row begins with 'frist'; did you mean 'first'"):
         suite.run(measurements(), Context(), ["frist"])
+
+
+def test_every_row_tells_its_memory():
+    """The peak of a row does not hold what rows before it took and gave back."""
+
+    def rows(context):
+        large = torch.ones(60_000_000)
+        yield row(id="a.large")
+        del large
+        gc.collect()
+        yield row(id="a.after")
+
+    first, second = suite.run([Measurement("a", rows)], Context())
+    assert first.peak_mb > 200
+    assert second.peak_mb <= first.peak_mb

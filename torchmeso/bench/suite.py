@@ -6,11 +6,14 @@ What was not measured is a row without a value and with the reason, never an inv
 Test: tests/bench/test_suite.py
 """
 
+import contextlib
 import fnmatch
 import json
 import os
+import re
+import resource
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -39,6 +42,7 @@ class Row:
         n: repetitions.
         why: why there is no value.
         curve: place in a plot: {"series", "x", ...}.
+        peak_mb: largest resident memory of the process since the row before.
     """
 
     id: str
@@ -52,6 +56,7 @@ class Row:
     n: int = 1
     why: str | None = None
     curve: dict[str, Any] | None = None
+    peak_mb: int | None = None
 
     @property
     def met(self) -> bool | None:
@@ -111,11 +116,23 @@ def run(measurements: Sequence[Measurement], context: Context, only: Sequence[st
     rows: list[Row] = []
     for m in select(measurements, only):
         context.report(f"bench {m.name}", 0)
-        found = list(m.run(context))
+        _peak()
+        found = [replace(row, peak_mb=_peak()) for row in m.run(context)]
         patterns = [wanted for wanted in only if wanted.startswith(f"{m.name}.")]
         rows += [r for r in found if not patterns or any(_fits(r.id, p) for p in patterns)]
         context.report(f"bench {m.name}", 1)
     return rows
+
+
+def _peak() -> int:
+    """Return the largest resident memory since the last call, in MB; where that is not known, of the whole process."""
+    status = Path("/proc/self/status")
+    if not status.exists():
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10
+    found = re.search(r"VmHWM:\s*(\d+) kB", status.read_text())
+    with contextlib.suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")
+    return int(found[1]) >> 10 if found else 0
 
 
 def _fits(row_id: str, wanted: str) -> bool:
