@@ -3,7 +3,7 @@
 Everything here is made once per scene: a frame changes cameras and lights only. All tables of all materials stand in
 one buffer, each on a block of 64 bytes, because a kernel's arguments cannot be a list.
 
-Kernels: kernels_cl/render/silhouette.clh, kernels_cl/data/*.clh          Test: tests/render/test_device.py
+Kernels: kernels_cl/render/scene.clh, kernels_cl/data/*.clh          Test: tests/render/test_device.py
 """
 
 import math
@@ -37,7 +37,7 @@ FACET = np.dtype(
     + [(name, "f4") for name in ("turn", "scale")]
     + [("normal", "f4", 3), ("corner", "i4", 3), ("first", "f4", 3), ("second", "f4", 3)]
 )
-"""A face as kernels read it, in one line of the cache; see `Facet` in kernels_cl/render/silhouette.clh."""
+"""A face as kernels read it, in one line of the cache; see `Facet` in kernels_cl/render/scene.clh."""
 
 REFLECTANCE = np.dtype(
     [(name, "i4") for name in ("there", "height", "width", "groups", "codes", "light_rings", "light_count")]

@@ -244,7 +244,7 @@ class Renderer:
         picture.draw()
 
     def _skip_bits(self) -> int:
-        """Return the skips as `SKIP_*` in kernels_cl/render/silhouette.clh."""
+        """Return the skips as `SKIP_*` in kernels_cl/render/scene.clh."""
         s = self._skips
         return s.empty | s.behind << 1 | s.bounds << 2 | s.losers << 3 | s.facing << 4
 
