@@ -9,7 +9,6 @@ Test: tests/bench/test_peers.py
 
 import ctypes.util
 import json
-import logging
 import os
 import shutil
 import subprocess
@@ -22,7 +21,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
@@ -42,20 +40,6 @@ void main() {
   if (gl_FragCoord.z <= texelFetch(nearer, ivec2(gl_FragCoord.xy), 0).r + 1e-7) discard;
   o = vec4(gl_FragCoord.z);
 }"""
-
-
-def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return `function` through torch's compiler; the parts that it cannot compile run eagerly.
-
-    Raises:
-        PeerMissing: there is no C++ compiler.
-    """
-    if shutil.which("c++") is None and shutil.which("g++") is None:
-        raise PeerMissing("torch.compile: no C++ compiler; install g++")
-    for name in ("torch._dynamo", "torch._inductor"):
-        logging.getLogger(name).setLevel(logging.CRITICAL)
-    import_module("torch._dynamo").config.suppress_errors = True
-    return torch.compile(function, dynamic=True)
 
 
 class Llvmpipe:
@@ -157,6 +141,23 @@ def mitsuba(
         reason = run.stderr.strip().splitlines()[-1:] or ["no word"]
         raise PeerMissing(f"Mitsuba ({reason[0]}); pip install 'torchmeso[mitsuba]' and the package libllvm19")
     return json.loads(run.stdout.splitlines()[-1])["ms"]
+
+
+def compiled_torch(*, n: int) -> tuple[list[float], float]:
+    """Return the milliseconds of `n` frames of the 12k knot through torch.compile, and the seconds that compiling took.
+
+    Raises:
+        PeerMissing: there is no C++ compiler, or what it made does not run.
+    """
+    if shutil.which("c++") is None and shutil.which("g++") is None:
+        raise PeerMissing("torch.compile: no C++ compiler; install g++")
+    command = [sys.executable, "-m", "torchmeso.bench.compiled_peer", str(n)]
+    run = subprocess.run(command, capture_output=True, text=True, check=False)
+    if run.returncode:
+        reason = run.stderr.strip().splitlines()[-1:] or ["no word"]
+        raise PeerMissing(f"torch.compile ended with status {run.returncode} ({reason[0].strip()})")
+    found = json.loads(run.stdout.splitlines()[-1])
+    return found["ms"], found["compiling"]
 
 
 def embree_first_hit(camera: Camera, vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Callable[[], Any]:

@@ -336,6 +336,7 @@ MEASUREMENTS = [
     Measurement("mdf", mdf),
     Measurement("frame", speed.frame),
     Measurement("growth", speed.growth),
+    Measurement("compiled", speed.compiled),
 ]
 """In the order they run."""
 
