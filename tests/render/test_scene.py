@@ -64,7 +64,7 @@ def test_selected_points_are_the_same_points():
 
 def test_rays_go_through_pixel_centres():
     view = camera((0, 0, 3), size=5)
-    _, direction, _ = rays(view, torch.tensor([12]))
+    _, direction, _ = rays(view, torch.tensor([12]), torch.float32)
     torch.testing.assert_close(direction[0], torch.tensor([0.0, 0, -1]), **FLOAT32)
 
 

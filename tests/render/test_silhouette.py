@@ -86,7 +86,7 @@ def test_length_bound_skips_only_intervals_that_hit(name):
 
     def depth(fragment, turn):
         points = interpolate(world, layers, view, fragment)
-        w = frames.to_local(points.frame, turn * rays(view, layers.pixel[fragment])[1])
+        w = frames.to_local(points.frame, turn * rays(view, layers.pixel[fragment], layers.t.dtype)[1])
         return points.scale * RayCastMdf(meso).evaluate(points.uv, w)
 
     expected = depth(found.front, -1) + depth(found.back, 1) <= layers.t[found.back] - layers.t[found.front]
