@@ -178,6 +178,80 @@ def test_shadow_maps_rest_while_the_light_does(still_life, device):
     assert renderer.counts["shadow maps drawn"] == 2
 
 
+def test_only_what_changed_is_uploaded(still_life, brick, device):
+    """Scene after scene: the picture of a renderer made for it, and what was the same is not made again."""
+    view, options = camera((1.5, 2.0, 3.5)), FrameOptions(shadow_map_size=128)
+    first = Scene(objects=still_life, lights=LIGHTS["spot"])
+    torus, ball, *rest = still_life
+    painted = replace(torus, material=replace(brick, btf=replace(brick.btf, scale=0.5 * brick.btf.scale)))
+    flat = replace(torus, material=replace(brick, mdf=None))
+    moving = replace(torus, mesh=moved(torus.mesh, x=-0.2, y=0.1))
+    red = replace(ball, material=Material(albedo=(0.2, 0.2, 0.9)))
+    faces = sum(len(o.mesh.faces) for o in still_life)
+    steps = {
+        "nothing": (first, 0, 0, 0),
+        "background": (replace(first, background=(0.3, 0.2, 0.1)), 0, 0, 0),
+        "albedo": (replace(first, objects=(torus, red, *rest)), 0, 0, 0),
+        "a BTF": (replace(first, objects=(painted, ball, *rest)), 0, 1, 0),
+        "an MDF": (replace(first, objects=(flat, ball, *rest)), 0, 0, 2),  # the floor still has the BTF
+        "a mesh": (replace(first, objects=(moving, ball, *rest)), faces, 0, 2),
+        "an object": (replace(first, objects=(torus, ball)), len(torus.mesh.faces) + len(ball.mesh.faces), 0, 2),
+        "no ambient": (replace(first, objects=(torus, ball), ambient=0.0), 0, 1, 0),
+        "light": (replace(first, objects=(torus, ball), ambient=0.0, lights=LIGHTS["sun"]), 0, 0, 1),
+        "all": (first, faces, 2, 2),
+    }
+    renderer = Renderer(first, options)
+    renderer.render(view)
+    assert renderer.counts["tables uploaded"] == 3
+    for name, (scene, n_face, n_table, n_map) in steps.items():
+        renderer.update(scene)
+        mine, fresh = renderer.render(view), Renderer(scene, options).render(view)
+        assert torch.equal(mine.rgb, fresh.rgb), name
+        assert torch.equal(mine.shadowed, fresh.shadowed), name
+        found = [renderer.counts[x] for x in ("faces uploaded", "tables uploaded", "shadow maps drawn")]
+        assert found == [n_face, n_table, n_map], name
+        assert torch.equal(renderer.render(view).rgb, fresh.rgb), name
+        assert renderer.counts["faces uploaded"] == renderer.counts["tables uploaded"] == 0
+
+
+def test_a_light_drawn_after_a_material_changed_sees_the_new_one(still_life, device):
+    view, options = camera((1.5, 2.0, 3.5)), FrameOptions(shadow_map_size=128)
+    plain = tuple(replace(o, material=replace(o.material, btf=None)) for o in still_life)
+    scene = Scene(objects=plain, lights=LIGHTS["sun"])
+    renderer = Renderer(Scene(objects=still_life, lights=LIGHTS["sun"]), options)
+    renderer.render(view)
+    renderer.update(scene)
+    fresh = Renderer(replace(scene, lights=LIGHTS["point"]), options).render(view)
+    assert torch.equal(renderer.render(view, LIGHTS["point"]).shadowed, fresh.shadowed)
+
+
+def test_triangles_stay_while_the_camera_does(still_life, device):
+    """The light moves over them; with the eye in a body and triangles cut at the near plane too."""
+    scene = Scene(objects=still_life, lights=LIGHTS["sun"])
+    options = FrameOptions(shadow_map_size=128)
+    for eye in ((1.5, 2.0, 3.5), (0.0, 0.3, 0.9), (0.0, 0.4, 0.1)):
+        renderer = Renderer(scene, options)
+        kept = []
+        for light in ("sun", "point", "spot", "spot"):
+            mine = renderer.render(camera(eye), LIGHTS[light])
+            fresh = Renderer(scene, options).render(camera(eye), LIGHTS[light])
+            assert torch.equal(mine.rgb, fresh.rgb)
+            assert mine.counts["triangles drawn"] == fresh.counts["triangles drawn"]
+            kept.append(mine.counts["triangles kept"])
+        assert kept[3] > kept[2] == 0  # other sizes of maps make a new picture
+        assert renderer.render(camera((1.0, 2.0, 3.5)), LIGHTS["spot"]).counts["triangles kept"] == 0
+
+
+def test_a_scene_that_cannot_be_read_leaves_the_one_before(still_life, device):
+    scene, view = Scene(objects=still_life, lights=LIGHTS["sun"]), camera((1.5, 2.0, 3.5))
+    renderer = Renderer(scene, FrameOptions(shadow_map_size=128))
+    before = renderer.render(view).rgb.clone()
+    bad = replace(still_life[0], material=Material(mdf=RayCastMdf(generators.sheet())))
+    with pytest.raises(BackendError, match="got RayCastMdf"):
+        renderer.update(replace(scene, objects=(bad, *still_life[1:])))
+    assert torch.equal(renderer.render(view).rgb, before)
+
+
 def test_what_kernels_cannot_read(device):
     objects = (Object(mesh=shapes.sphere(triangles=100), material=Material(mdf=RayCastMdf(generators.sheet()))),)
     with pytest.raises(BackendError, match="expected an MDF of 8 bits, got RayCastMdf"):

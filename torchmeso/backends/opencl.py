@@ -221,6 +221,16 @@ def allocate(size: int) -> "cl.Buffer":
         raise BackendError(f"opencl: no room for a buffer of {human_size(size)} ({error})") from error
 
 
+def copy(source: "cl.Buffer", target: "cl.Buffer", first: int, at: int, size: int) -> None:
+    """Copy `size` bytes from byte `first` of one buffer to byte `at` of another."""
+    _pyopencl().enqueue_copy(queue(), target, source, src_offset=first, dst_offset=at, byte_count=size)
+
+
+def store(x: np.ndarray, target: "cl.Buffer", at: int) -> None:
+    """Copy `x` to byte `at` of a buffer, and wait for that."""
+    _pyopencl().enqueue_copy(queue(), target, x, dst_offset=at, is_blocking=True)
+
+
 class Shared:
     """An array that host and device both read and write, a few values per frame.
 

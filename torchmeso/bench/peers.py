@@ -1,6 +1,4 @@
-"""Other programs on the same triangles, for ratios taken in one run: llvmpipe (OpenGL on the CPU), Embree, Mitsuba.
-
-And torch's own compiler.
+"""Other programs for ratios taken in one run: llvmpipe (OpenGL on the CPU), Embree, Mitsuba, torch's own compiler.
 
 Extra `peers`: moderngl and open3d; llvmpipe also needs the Debian packages libegl1 and libgl1-mesa-dri.
 
@@ -25,9 +23,17 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchmeso.bench.scenes import knot_view
-from torchmeso.bench.timing import time_together
+from torchmeso.bench.timing import Timing, time_together
 from torchmeso.geometry import shapes
 from torchmeso.geometry.camera import Camera
+
+Rays = Float[np.ndarray, "n 3"]
+Distances = Callable[[], np.ndarray]
+Caster = Callable[[Rays, Rays], Distances]
+"""Takes origins and directions, returns a call that casts these rays."""
+
+MISSED = 1e30
+"""Distances of rays that hit something are less."""
 
 FAR = 1e3
 """Far plane of the peers in units of the near plane they are given."""
@@ -92,31 +98,51 @@ class PeerMissing(Exception):
 
 
 class Embree:
-    """Camera rays, and shadow rays from where they hit, by open3d's RaycastingScene on both cores."""
+    """Camera rays, and shadow rays from where they hit, by Embree: through open3d on all cores, through embreex on one.
+
+    Attributes:
+        calls: by "open3d primary", "open3d primary + shadow", and so with embreex. Time of embreex counts as CPU time
+            over cores, as if it used them all.
+        missing: what is not installed of the two.
+    """
 
     def __init__(
         self, vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], camera: Camera, light: Float[Tensor, "3"]
     ):
-        """Build the scene and all rays; `light` is the direction towards it.
+        """Build both scenes and all rays; `light` is the direction towards it.
 
         Raises:
-            PeerMissing: open3d does not load.
+            PeerMissing: neither loads.
         """
-        self.primary = embree_first_hit(camera, vertices, faces)
-        open3d: Any = import_module("open3d")
-        tensor = open3d.core.Tensor
-        self._scene = open3d.t.geometry.RaycastingScene()
-        self._scene.add_triangles(tensor(vertices.float().numpy()), tensor(faces.numpy().astype(np.uint32)))
-        t = self.primary()["t_hit"].numpy()
-        origin, direction, _ = camera.rays(camera.pixel_centres().reshape(-1, 2))
-        hit = np.isfinite(t)
-        place = origin.numpy()[hit] + t[hit, None] * direction.numpy()[hit] + 1e-3 * light.numpy()
-        self._shadow = tensor(np.concatenate([place, np.broadcast_to(light.numpy(), place.shape)], 1).astype("f4"))
+        self.calls: dict[str, Callable[[], Any]] = {}
+        missing = []
+        for name, peer in (("open3d", _open3d_rays), ("embreex", _embreex_rays)):
+            try:
+                first_hit, occluded = peer(vertices, faces)
+            except PeerMissing as error:
+                missing.append(str(error))
+                continue
+            primary = _camera_rays(camera)
+            t = first_hit(*primary)()
+            hit = t < MISSED
+            place = primary[0][hit] + t[hit, None] * primary[1][hit] + np.float32(1e-3) * light.numpy()
+            toward = np.ascontiguousarray(np.broadcast_to(light.float().numpy(), place.shape))
+            calls = first_hit(*primary), occluded(np.ascontiguousarray(place, np.float32), toward)
+            self.calls[f"{name} primary"] = calls[0]
+            self.calls[f"{name} primary + shadow"] = lambda calls=calls: [call() for call in calls]
+        self.missing = "; ".join(missing)
+        if not self.calls:
+            raise PeerMissing(self.missing)
 
-    def both(self) -> None:
-        """Cast the camera rays, then the shadow rays."""
-        self.primary()
-        self._scene.test_occlusions(self._shadow)
+    def faster(self, timing: dict[str, Timing], rays: str) -> Timing:
+        """Return the time of the faster of the two for "primary" or "primary + shadow" rays."""
+        found = []
+        if f"open3d {rays}" in timing:
+            found.append(timing[f"open3d {rays}"])
+        if f"embreex {rays}" in timing:
+            t = timing[f"embreex {rays}"]
+            found.append(t._replace(wall=t.cpu, low=t.low * t.cpu / t.wall, high=t.high * t.cpu / t.wall))
+        return min(found, key=lambda t: t.wall)
 
 
 def mitsuba(
@@ -160,12 +186,22 @@ def compiled_torch(*, n: int) -> tuple[list[float], float]:
     return found["ms"], found["compiling"]
 
 
-def embree_first_hit(camera: Camera, vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Callable[[], Any]:
+def embree_first_hit(camera: Camera, vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Distances:
     """Return a call that casts all camera rays by open3d's RaycastingScene and finds first hits.
 
     Raises:
         PeerMissing: open3d does not load.
     """
+    return _open3d_rays(vertices, faces)[0](*_camera_rays(camera))
+
+
+def _camera_rays(camera: Camera) -> tuple[Rays, Rays]:
+    origin, direction, _ = camera.rays(camera.pixel_centres().reshape(-1, 2))
+    return np.ascontiguousarray(origin.float().numpy()), np.ascontiguousarray(direction.float().numpy())
+
+
+def _open3d_rays(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> tuple[Caster, Caster]:
+    """Return what makes calls of origins and directions: one for distances, one for whether anything is hit."""
     try:
         open3d: Any = import_module("open3d")
     except (ImportError, OSError) as error:
@@ -173,9 +209,36 @@ def embree_first_hit(camera: Camera, vertices: Float[Tensor, "V 3"], faces: Int[
     tensor = open3d.core.Tensor
     scene = open3d.t.geometry.RaycastingScene()
     scene.add_triangles(tensor(vertices.float().numpy()), tensor(faces.numpy().astype(np.uint32)))
-    origin, direction, _ = camera.rays(camera.pixel_centres().reshape(-1, 2))
-    rays = tensor(np.concatenate([origin.numpy(), direction.numpy()], 1))
-    return lambda: scene.cast_rays(rays)
+
+    def first_hit(origin: Rays, direction: Rays) -> Distances:
+        rays = tensor(np.concatenate([origin, direction], 1))
+        return lambda: scene.cast_rays(rays)["t_hit"].numpy()
+
+    def occluded(origin: Rays, direction: Rays) -> Distances:
+        rays = tensor(np.concatenate([origin, direction], 1))
+        return lambda: scene.test_occlusions(rays).numpy()
+
+    return first_hit, occluded
+
+
+def _embreex_rays(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> tuple[Caster, Caster]:
+    """Return the same by embreex, called directly, in Embree's fast mode."""
+    try:
+        scenes: Any = import_module("embreex.rtcore_scene")
+        meshes: Any = import_module("embreex.mesh_construction")
+    except (ImportError, OSError) as error:
+        raise PeerMissing(f"embreex ({error})") from error
+    scene = scenes.EmbreeScene(robust=False)
+    arrays = np.ascontiguousarray(vertices.float().numpy()), np.ascontiguousarray(faces.int().numpy())
+    mesh = meshes.TriangleMesh(scene, *arrays)
+
+    def first_hit(origin: Rays, direction: Rays) -> Distances:
+        return lambda mesh=mesh: scene.run(origin, direction, query="DISTANCE")  # 1e37 where nothing is hit
+
+    def occluded(origin: Rays, direction: Rays) -> Distances:
+        return lambda mesh=mesh: scene.run(origin, direction, query="OCCLUDED")
+
+    return first_hit, occluded
 
 
 def llvmpipe_probe() -> float | None:

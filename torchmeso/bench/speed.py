@@ -6,6 +6,7 @@ unless a row says otherwise.
 Test: tests/bench/test_speed.py
 """
 
+import itertools
 import resource
 import subprocess
 import sys
@@ -45,7 +46,7 @@ def renderer(scene: Scene, silhouette: Silhouette, *, shadows: bool) -> Renderer
 
 def frame(context: Context) -> Iterator[Row]:
     """Frames beside peers, the first frame, memory."""
-    for measure in (against_embree, against_itself, first_frame, memory):
+    for measure in (against_embree, against_itself, updates, first_frame, memory):
         yield from measure(context)
 
 
@@ -66,13 +67,15 @@ def against_embree(context: Context) -> Iterator[Row]:
                 for shadows in (False, True):
                     drawn = renderer(scene, silhouette, shadows=shadows)
                     calls[f"{silhouette}{' + shadows' * shadows}"] = partial(drawn.show, camera)
-            missing = None
+            missing, rays = None, None
             try:
                 rays = peers.Embree(displaced.vertices, displaced.faces, camera, light.direction)
-                calls |= {"Embree primary": rays.primary, "Embree primary + shadow": rays.both}
+                calls |= rays.calls
             except PeerMissing as error:
                 missing = str(error)
             timing = time_together(calls, n=9 if context.quick else 25, warm=3, settle=4)
+            if rays is not None:
+                timing |= {f"Embree {x}": rays.faster(timing, x) for x in ("primary", "primary + shadow")}
             percent = round(100 * coverage)
             n = len(displaced.faces)
             for silhouette in ("paper", "curved"):
@@ -160,7 +163,8 @@ def against_itself(context: Context) -> Iterator[Row]:
         lights=scene.lights,
     )
     plain = renderer(bare, "curved", shadows=False)
-    least = Renderer(bare, FrameOptions(silhouette="none", shadows=False), one_layer=True)
+    options = FrameOptions(silhouette="none", shadows=False, skips=Skips(resting=False))
+    least = Renderer(bare, options, one_layer=True)
     timing = time_together(
         {"plain": lambda: plain.show(camera), "one layer": lambda: least.show(camera)},
         n=25 if context.quick else 61, warm=3, settle=4,
@@ -198,6 +202,40 @@ def compiled(context: Context) -> Iterator[Row]:
         row, value=round(median(ms) / ours.wall, 2), n=len(ms),
         peer=f"torch.compile {median(ms):.0f} ms after {compiling:.0f} s of compiling, ours {ours.wall:.1f} ms",
     )  # fmt: skip
+
+
+def updates(context: Context) -> Iterator[Row]:
+    """A frame in which something changed alone, beside one of a new renderer."""
+    timed = frames.knot()
+    scene = frames.build(timed, context.report)
+    camera = frames.camera_at(scene, timed, 0.28)
+    body, options = scene.objects[0], FrameOptions(shadow_map_size=MAP)
+    btf, sun, steps = body.material.btf, scene.lights[0], itertools.count(1)
+    assert isinstance(btf, EigenBtf)
+    assert isinstance(sun, DirectionalLight)
+    changes: dict[str, Callable[[], Scene]] = {
+        "mesh": lambda: replace(scene, objects=(replace(body, mesh=replace(body.mesh)),)),
+        "material": lambda: replace(scene, objects=(replace(body, material=replace(body.material, btf=replace(btf))),)),
+        "light": lambda: replace(scene, lights=(replace(sun, irradiance=next(steps) * sun.irradiance),)),
+        "nothing": lambda: scene,
+    }
+    renderers = {name: Renderer(scene, options) for name in changes}
+
+    def draw(name: str) -> None:
+        renderers[name].update(changes[name]())
+        renderers[name].show(camera)
+
+    calls: dict[str, Callable[[], object]] = {name: partial(draw, name) for name in changes}
+    calls["all"] = lambda: Renderer(scene, options).show(camera)
+    timing = time_together(calls, n=9 if context.quick else 25, warm=3, settle=1)
+    for name in changes:
+        yield Row(
+            id=f"frame.update.{name}",
+            what=f"12k knot: a new renderer's frame, over a frame in which {name} changed",
+            value=round(timing["all"].wall / timing[name].wall, 2), unit="x", better="higher", n=timing["all"].n,
+            peer=f"new {timing['all'].wall:.1f} ms, {name} changed {timing[name].wall:.1f} ms",
+            curve={"series": "update", "x": name, "ms": round(timing[name].wall, 2)},
+        )  # fmt: skip
 
 
 def first_frame(context: Context) -> Iterator[Row]:

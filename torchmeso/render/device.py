@@ -1,12 +1,14 @@
 """A scene as the kernels read it: geometry, look-up tables and lights packed into a few buffers.
 
-Everything here is made once per scene: a frame changes cameras and lights only. All tables of all materials stand in
-one buffer, each on a block of 64 bytes, because a kernel's arguments cannot be a list.
+Geometry and tables are uploaded apart from each other, and a table once, however many materials share it and however
+often the scene changes around it. All tables stand in one buffer, each on a block of 64 bytes, because a kernel's
+arguments cannot be a list.
 
 Kernels: kernels_cl/render/scene.clh, kernels_cl/data/*.clh          Test: tests/render/test_device.py
 """
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -24,7 +26,7 @@ from torchmeso.geometry.directions import normalize
 from torchmeso.geometry.hemisphere import DirectionSet
 from torchmeso.geometry.light import DirectionalLight, Light, SpotLight
 from torchmeso.render.device_raster import DeviceMesh, upload_mesh
-from torchmeso.render.scene import Material, Scene, World
+from torchmeso.render.scene import Material, World
 
 BLOCK, GROUP = 64, 4
 """Bytes that tables are aligned to, and components that stand in one vector."""
@@ -58,65 +60,140 @@ LIGHT = np.dtype(
 )  # fmt: skip
 
 
-class DeviceScene(NamedTuple):
-    """The buffers of a scene.
+ADDRESSES = {
+    REFLECTANCE: ("light_rings", "view_rings", "maps", "weights", "scale", "offset", "ambient"),
+    MDF: ("rings", "delta", "missing", "relief", "plateau", "hole"),
+}
+"""Fields that say on which block a table begins; -1 = there is none."""
+
+
+class DeviceGeometry(NamedTuple):
+    """The meshes of a scene on the device.
 
     Attributes:
-        mesh: all meshes as one.
+        mesh: all as one.
         records: (V, 16) float32, see `RECORD`.
         facets: (F,) see `FACET`.
-        tables: everything that is looked up.
-        mdfs: (object,) see `MDF`.
-        reflectances: (object,) see `REFLECTANCE`.
-        textured: whether any object has a mesostructure.
-        nbytes: of all of them.
     """
 
     mesh: DeviceMesh
     records: "opencl.Buffer"
     facets: "opencl.Buffer"
+
+
+class DeviceMaterials(NamedTuple):
+    """The materials of a scene on the device.
+
+    Attributes:
+        tables: everything that is looked up.
+        mdfs: (object,) see `MDF`.
+        reflectances: (object,) see `REFLECTANCE`.
+        textured: whether any object has a mesostructure.
+        parts: the BTFs and MDFs in `tables`, by identity.
+        packed: how many of them were uploaded, not taken over.
+    """
+
     tables: "opencl.Buffer"
     mdfs: "opencl.Buffer"
     reflectances: "opencl.Buffer"
     textured: bool
-    nbytes: int
+    parts: "dict[tuple[int, bool], _Part]"
+    packed: int
 
 
-def upload(scene: Scene, world: World, *, silhouettes: bool, ambient: bool) -> DeviceScene:
-    """Return `scene` on the device.
+class _Part(NamedTuple):
+    """A BTF or an MDF in the tables."""
+
+    source: object  # kept, so that nothing else can take its identity
+    first: int  # block
+    blocks: int
+    record: np.ndarray  # (1,), addresses counted from `first`
+
+
+def upload_geometry(world: World) -> DeviceGeometry:
+    """Return all meshes of a scene on the device.
+
+    Raises:
+        BackendError: there is no device.
+    """
+    tags = torch.stack([(world.component << 2) | (world.closed[world.component].long() << 1), world.owner], 1)
+    return DeviceGeometry(
+        upload_mesh(world.vertices, world.faces, tags),
+        opencl.upload(vertex_records(world)),
+        opencl.upload(face_records(world, tags)),
+    )
+
+
+def upload_materials(
+    materials: Sequence[Material], *, silhouettes: bool, ambient: bool, before: DeviceMaterials | None = None
+) -> DeviceMaterials:
+    """Return the materials of a scene's objects on the device.
 
     Args:
-        scene: materials.
-        world: its meshes as one.
+        materials: of each object.
         silhouettes: whether the mesostructure has depth; without, MDFs are not read.
         ambient: whether the ambient term is needed.
+        before: what stands on the device already; BTFs and MDFs that are the same objects are taken over from there.
 
     Raises:
         BackendError: there is no device, or a material is of a kind that kernels do not read.
     """
-    pool = _Pool()
-    shared: dict[int, tuple[np.ndarray, np.ndarray]] = {}
-    reflectances, mdfs = np.zeros(len(scene.objects), REFLECTANCE), np.zeros(len(scene.objects), MDF)
-    for i, item in enumerate(scene.objects):
-        material = item.material
-        if id(material) not in shared:
-            shared[id(material)] = (
-                _reflectance(pool, material, ambient=ambient),
-                _mdf(pool, material.mdf) if silhouettes and material.mdf is not None else np.zeros(1, MDF),
-            )
-        reflectances[i], mdfs[i] = shared[id(material)][0][0], shared[id(material)][1][0]
-    tags = torch.stack([(world.component << 2) | (world.closed[world.component].long() << 1), world.owner], 1)
-    records, facets, tables = vertex_records(world), face_records(world, tags), pool.joined()
-    return DeviceScene(
-        upload_mesh(world.vertices, world.faces, tags),
-        opencl.upload(records),
-        opencl.upload(facets),
-        opencl.upload(tables),
-        opencl.upload(mdfs),
-        opencl.upload(reflectances),
-        bool(mdfs["there"].any()),
-        records.nbytes + facets.nbytes + tables.nbytes,
-    )
+    wanted: dict[tuple[int, bool], EigenBtf | Mdf] = {}
+    for m in materials:
+        if m.btf is not None:
+            wanted[id(m.btf), ambient] = _readable(m.btf)
+        if m.mdf is not None and silhouettes:
+            wanted[id(m.mdf), False] = _readable_mdf(m.mdf)
+    there = before.parts if before is not None else {}
+    new = {key: source for key, source in wanted.items() if key not in there}
+    if before is not None and not new:
+        tables, parts = before.tables, there
+    else:
+        tables, parts = _join({key: there[key] for key in wanted if key in there}, new, before)
+
+    reflectances, mdfs = np.zeros(len(materials), REFLECTANCE), np.zeros(len(materials), MDF)
+    for i, m in enumerate(materials):
+        if m.btf is not None:
+            reflectances[i] = _placed(parts[id(m.btf), ambient])
+        reflectances[i]["albedo"] = m.albedo
+        if m.mdf is not None and silhouettes:
+            mdfs[i] = _placed(parts[id(m.mdf), False])
+    textured = bool(mdfs["there"].any())
+    return DeviceMaterials(tables, opencl.upload(mdfs), opencl.upload(reflectances), textured, parts, len(new))
+
+
+def _join(
+    kept: "dict[tuple[int, bool], _Part]", new: "dict[tuple[int, bool], EigenBtf | Mdf]", before: DeviceMaterials | None
+) -> "tuple[opencl.Buffer, dict[tuple[int, bool], _Part]]":
+    """Return a buffer with the parts that are `kept`, copied on the device, and behind them the `new` ones."""
+    parts, copies, blocks = {}, [], 0
+    for key, part in kept.items():
+        copies.append((part.first * BLOCK, blocks * BLOCK, part.blocks * BLOCK))
+        parts[key] = part._replace(first=blocks)
+        blocks += part.blocks
+    arrays = []
+    for key, source in new.items():
+        pool = _Pool()
+        record = _reflectance(pool, source, ambient=key[1]) if isinstance(source, EigenBtf) else _mdf(pool, source)
+        arrays.append(pool.joined())
+        parts[key] = _Part(source, blocks, len(arrays[-1]) // BLOCK, record)
+        blocks += parts[key].blocks
+    fresh = np.concatenate(arrays) if arrays else np.zeros(BLOCK, np.uint8)
+    if not copies or before is None:
+        return opencl.upload(fresh), parts
+    tables = opencl.allocate(blocks * BLOCK)
+    for source, target, size in copies:
+        opencl.copy(before.tables, tables, source, target, size)
+    opencl.store(fresh, tables, blocks * BLOCK - len(fresh))
+    return tables, parts
+
+
+def _placed(part: _Part) -> np.ndarray:
+    """Return a part's record with addresses counted from the beginning of all tables."""
+    record = part.record.copy()
+    for name in ADDRESSES[record.dtype]:
+        record[name] += np.where(record[name] >= 0, part.first, 0)
+    return record[0]
 
 
 def vertex_records(world: World) -> Float[np.ndarray, "V 16"]:
@@ -158,14 +235,21 @@ def light_records(lights: tuple[Light, ...]) -> np.ndarray:
     return records
 
 
-def _reflectance(pool: "_Pool", material: Material, *, ambient: bool) -> np.ndarray:
-    record = np.zeros(1, REFLECTANCE)
-    btf = material.btf
-    if btf is None:
-        record["albedo"] = material.albedo
-        return record
+def _readable(btf: object) -> EigenBtf:
     if not isinstance(btf, EigenBtf):
         raise BackendError(f"opencl: expected an eigen BTF, got {type(btf).__name__}; use the torch backend")
+    return btf
+
+
+def _readable_mdf(mdf: object) -> Mdf:
+    if not isinstance(mdf, Mdf) or mdf.delta.dtype != torch.uint8:
+        kind = f"{mdf.delta.dtype}" if isinstance(mdf, Mdf) else type(mdf).__name__
+        raise BackendError(f"opencl: expected an MDF of 8 bits, got {kind}; use the torch backend")
+    return mdf
+
+
+def _reflectance(pool: "_Pool", btf: EigenBtf, *, ambient: bool) -> np.ndarray:
+    record = np.zeros(1, REFLECTANCE)
     groups = -(-btf.rank // GROUP)
     codes = btf.maps.dtype == torch.uint8
     height, width = btf.texels
@@ -206,10 +290,7 @@ def _grouped(x: Tensor) -> Tensor:
     return padded.reshape(*batch, groups, 16)
 
 
-def _mdf(pool: "_Pool", mdf: object) -> np.ndarray:
-    if not isinstance(mdf, Mdf) or mdf.delta.dtype != torch.uint8:
-        kind = f"{mdf.delta.dtype}" if isinstance(mdf, Mdf) else type(mdf).__name__
-        raise BackendError(f"opencl: expected an MDF of 8 bits, got {kind}; use the torch backend")
+def _mdf(pool: "_Pool", mdf: Mdf) -> np.ndarray:
     record = np.zeros(1, MDF)
     delta = hemisphere.with_pole(mdf.delta, mdf.directions)
     paired = torch.stack([delta, delta[_next_in_ring(mdf.directions)]], -1)

@@ -41,6 +41,12 @@ COUNTERS = (
 )  # fmt: skip
 """What the kernels count, in the order of `Counters` in kernels_cl/render/rasterize.clh; padded to 32."""
 
+OF_SET_UP = [
+    COUNTERS.index(x)
+    for x in ("vectors", "slots", "crossing", "behind", "degenerate", "drawn", "beside", "turned", "near_bodies")
+]
+"""Those that are known once the triangles stand on the screen."""
+
 
 class DeviceMesh(NamedTuple):
     """Triangles as the kernels read them.
@@ -52,7 +58,6 @@ class DeviceMesh(NamedTuple):
         objects: (object,) see `BOX`.
         balls: (object, 4) centre and radius of a ball around each object.
         ball: of one around all.
-        n_vertex: V.
         n_face: F.
     """
 
@@ -62,7 +67,6 @@ class DeviceMesh(NamedTuple):
     objects: "opencl.Buffer"
     balls: Float[np.ndarray, "object 4"]
     ball: tuple[float, float, float, float]
-    n_vertex: int
     n_face: int
 
 
@@ -93,25 +97,26 @@ def upload_mesh(
     objects, balls = np.zeros(n_object, BOX), np.zeros((n_object, 4))
     for i in range(n_object):
         own = tags[:, 1] == i
-        objects["centre"][i], objects["reach"][i], radius = _around(vertices[faces[own].unique()])
+        objects["centre"][i], objects["reach"][i], radius = _around(vertices[faces[own]])
         objects["body"][i] = bool((tags[own, 0] & 2).any())
         balls[i] = *objects["centre"][i], radius
-    centre, _, radius = _around(vertices[faces.unique()])
+    centre, _, radius = _around(vertices[faces])
     return DeviceMesh(
         opencl.upload(vertices.double().numpy()), opencl.upload(faces.int().numpy()),
         opencl.upload(tags.int().numpy()), opencl.upload(objects), balls, (*centre.tolist(), radius),
-        len(vertices), len(faces),
+        len(faces),
     )  # fmt: skip
 
 
-def _around(points: Float[Tensor, "n 3"]) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"], float]:
+def _around(points: Float[Tensor, "*n 3"]) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"], float]:
     """Return the middle of the box around `points`, half its sides, and the farthest distance from there."""
     if len(points) == 0:
         return np.zeros(3), np.zeros(3), 0.0
-    p = points.double().numpy()
-    low, high = p.min(0), p.max(0)
+    p = points.double().reshape(-1, 3).T.contiguous()
+    low, high = p.amin(1), p.amax(1)
     centre = (low + high) / 2
-    return centre, (high - low) / 2, float(np.linalg.norm(p - centre, axis=-1).max())
+    radius = (p - centre[:, None]).square().sum(0).max().sqrt()
+    return centre.numpy(), ((high - low) / 2).numpy(), float(radius)
 
 
 def _uncut(camera: Camera, mesh: DeviceMesh) -> bool:
@@ -139,7 +144,7 @@ class DeviceViews:
             count: cameras.
             cut_room: triangles that faces may become which cross the near plane or the guard band.
         """
-        self.mesh, self.count, self.may_cut, self._was_cut = mesh, count, True, True
+        self.mesh, self.count, self.may_cut, self._was_cut, self._aimed = mesh, count, True, True, b""
         self.padded = -(-max(mesh.n_face, 1) // 16) * 16
         self.stride = self.padded + -(-max(cut_room, 1024) // 16) * 16
         vectors = -(-(self.stride // 16) // 16) * 16
@@ -174,7 +179,9 @@ class DeviceViews:
             ),
         }  # fmt: skip
 
-    def aim(self, cameras: Sequence[Camera], *, taken: int, frustum: bool = True, cull: bool = False) -> None:
+    def aim(
+        self, cameras: Sequence[Camera], *, taken: int, frustum: bool = True, cull: bool = False, rest: bool = False
+    ) -> bool:
         """Set the cameras and put the set-up of all triangles into the queue.
 
         Args:
@@ -182,6 +189,10 @@ class DeviceViews:
             taken: layers that the tiles begin with.
             frustum: whether objects beside a view are left out.
             cull: whether faces of bodies that are turned away are left out, of bodies the eye is outside of.
+            rest: whether triangles stay where they are when the cameras are those of the last time.
+
+        Returns:
+            whether they stayed.
         """
         texels, self.may_cut = 0, False
         for r, camera in zip(self._views.array, cameras, strict=True):
@@ -192,16 +203,24 @@ class DeviceViews:
             r["texels"], r["frustum"], r["cull"] = texels, frustum, cull
             self.may_cut |= not _uncut(camera, self.mesh)
             texels += camera.width * camera.height
+        aimed = self._views.array.tobytes()
+        stays, self._aimed = rest and aimed == self._aimed, aimed
         counters = self._counters.array
+        kept = counters[:, OF_SET_UP]
         counters[:] = 0
         counters[:, COUNTERS.index("used")] = taken
         counters[:, COUNTERS.index("vectors")] = self.padded // 16
+        if stays:
+            counters[:, OF_SET_UP] = kept
         self._views.send()
         self._counters.send()
+        if stays:
+            return True
         self.steps["triangles"]()
         if self.may_cut or self._was_cut:
             self.steps["cut triangles"]()
         self._was_cut = self.may_cut
+        return False
 
     def counts(self) -> list[dict[str, int]]:
         """Wait, and return what each view did."""

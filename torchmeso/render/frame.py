@@ -38,7 +38,7 @@ class Skips:
         plain: without any mesostructure no silhouette code runs.
         losers: only what is seen is shaded.
         facing: points that lean away from all lights ask a screen for neither depth nor shadow.
-        resting: shadow maps stay while light and objects do.
+        resting: shadow maps stay while light and objects do, and triangles on the screen while the camera does.
         unlit: lights that reach no object are left out.
     """
 

@@ -2,18 +2,21 @@
 
     set up the camera's triangles -> [set up and draw the lights' maps] -> fill, test and shade tiles
 
-Scene tables are uploaded once; a new light draws its shadow map again, a new camera only the picture. The torch
-frame (`frame.render`) is the formula of all of this.
+A new light draws its shadow map again, a new camera only the picture. In a new scene, meshes are uploaded again when
+one of them changed, a BTF or an MDF when it was not there before, and shadow maps are drawn again when a mesh or an MDF
+changed. The torch frame (`frame.render`) is the formula of all of this.
 
 Kernels: kernels_cl/render/renderer.cl, kernels_cl/render/shadow_map.cl          Test: tests/render/test_renderer.py
 """
 
+import operator
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from torchmeso.backends import opencl
@@ -40,7 +43,7 @@ FRAME = np.dtype(
 
 
 class Renderer:
-    """Renders one scene on the device; cameras and lights may change from frame to frame."""
+    """Renders a scene on the device; cameras and lights may change from frame to frame, and the scene by `update`."""
 
     def __init__(self, scene: Scene, options: FrameOptions | None = None, *, one_layer: bool = False):
         """Upload `scene`; with `one_layer` only the nearest fragment of a pixel is kept (a yardstick for benchmarks).
@@ -50,23 +53,51 @@ class Renderer:
         """
         start = time.perf_counter()
         self.options = options or FrameOptions()
-        self._scene, world = scene, assemble(scene)
-        self._corners = shadow_map.corners_of(world)
-        silhouettes = self.options.silhouette != "none"
-        self._device = device.upload(scene, world, silhouettes=silhouettes, ambient=scene.ambient > 0)
-        self._skips = self.options.skips
-        textured = self._device.textured or not self._skips.plain
-        mode = {"none": 0, "paper": 1, "curved": 2}[self.options.silhouette] if textured else 0
-        self._plain = mode == 0 and silhouettes
-        self._defines = (f"-DSILHOUETTE={mode}", *(["-DONE_LAYER"] * one_layer))
-        self._cull = mode == 0 and self._skips.hidden  # where no surface has depth, faces turned away hide nothing
+        self._skips, self._one_layer = self.options.skips, one_layer
         self._workers = opencl.units()
         self._extra, self._cut_room, self._light_room = 4096, 0, 1
         self._lists: tuple[opencl.Buffer, opencl.Buffer] | None = None
         self._picture: _Picture | None = None
         self._maps: _Maps | None = None
         self.counts: dict[str, int] = {}
+        self._on_device = _upload(scene, self.options)
+        self._choose_code()
+        self._uploaded = self._on_device.since(None)
         self._seconds = {"upload": time.perf_counter() - start}
+
+    def update(self, scene: Scene) -> None:
+        """Render `scene` from now on; what is the same as before stays on the device.
+
+        Meshes, BTFs and MDFs are compared by identity: change a copy (`dataclasses.replace`), never one in place.
+
+        Raises:
+            BackendError: a material is of a kind that kernels do not read; the scene from before is still rendered.
+        """
+        start = time.perf_counter()
+        before, self._on_device = self._on_device, _upload(scene, self.options, self._on_device)
+        self._choose_code()
+        moved = self._on_device.geometry is not before.geometry
+        if self._maps is not None:
+            if moved:
+                self._maps.views = self._views(self._maps.views.count)
+            if moved or not _are(_depths(scene), _depths(before.scene)):
+                self._maps.lights = None
+            self._maps.draw = self._map_calls(self._maps)
+        if self._picture is not None:
+            if moved:
+                self._picture.views = self._views(1)
+            self._picture.draw = self._picture_call(self._picture)
+            self._picture.outputs = 0  # the background may be another
+        self._uploaded = self._on_device.since(before)
+        self._seconds = {"upload": time.perf_counter() - start}
+
+    def _choose_code(self) -> None:
+        """Compile in what this scene needs."""
+        textured = self._on_device.materials.textured or not self._skips.plain
+        mode = {"none": 0, "paper": 1, "curved": 2}[self.options.silhouette] if textured else 0
+        self._defines = (f"-DSILHOUETTE={mode}", *(["-DONE_LAYER"] * self._one_layer))
+        self._plain = mode == 0 and self.options.silhouette != "none"
+        self._cull = mode == 0 and self._skips.hidden  # where no surface has depth, faces turned away hide nothing
 
     def render(self, camera: Camera, lights: tuple[Light, ...] | None = None) -> Picture:
         """Return the picture seen by `camera`: linear colour, depth, object and shadows of each pixel.
@@ -97,7 +128,7 @@ class Renderer:
         return picture.shown[: camera.height, : camera.width]
 
     def _frame(self, camera: Camera, lights: tuple[Light, ...] | None, outputs: int) -> "_Picture":
-        given = lights = self._scene.lights if lights is None else lights
+        given = lights = self._on_device.scene.lights if lights is None else lights
         reaching = [i for i, light in enumerate(lights) if not self._skips.unlit or self._reaches(light)]
         lights = tuple(lights[i] for i in reaching) if len(reaching) < len(lights) else lights
         if len(lights) > MAX_LIGHTS:
@@ -108,7 +139,9 @@ class Renderer:
         while True:
             maps, picture = self._room(camera, lights)
             # The device sets the picture's triangles up while the lights' views are found.
-            picture.views.aim([camera], taken=self._taken, frustum=self._skips.frustum, cull=self._cull)
+            stays = picture.views.aim(
+                [camera], taken=self._taken, frustum=self._skips.frustum, cull=self._cull, rest=self._skips.resting
+            )
             drawn = maps is not None and self._draw_maps(maps, lights)
             self._draw_picture(picture, lights, outputs)
             counts = picture.views.counts()
@@ -121,8 +154,11 @@ class Renderer:
             "lights left out": len(given) - len(reaching),
             "shadow maps drawn": faces if drawn else 0,
             "shadow maps kept": 0 if drawn else faces,
+            "triangles kept": counts[0]["drawn"] if stays else 0,
             "frames without silhouette code": int(self._plain),
+            **self._uploaded,
         }
+        self._uploaded = dict.fromkeys(self._uploaded, 0)
         return picture
 
     def _reaches(self, light: Light) -> bool:
@@ -132,7 +168,8 @@ class Renderer:
             return False
         if not isinstance(light, SpotLight):
             return True
-        centre, radius = self._device.mesh.balls[:, :3], self._device.mesh.balls[:, 3]
+        balls = self._on_device.geometry.mesh.balls
+        centre, radius = balls[:, :3], balls[:, 3]
         way = centre - light.position.double().numpy()
         distance = np.maximum(np.linalg.norm(way, axis=-1), 1e-30)
         off_axis = np.arccos(np.clip(way @ light.axis.double().numpy() / distance, -1, 1))
@@ -189,38 +226,47 @@ class Renderer:
 
     def _draw_maps(self, maps: "_Maps", lights: tuple[Light, ...]) -> bool:
         """Draw the lights' maps, unless they are the same as before."""
-        if self._skips.resting and _same(maps.lights, lights):
+        if self._skips.resting and maps.lights is not None and _same(maps.lights, lights):
             return False
-        views = [v for light in lights for v in shadow_map.cameras(self._corners, light, self.options.shadow_map_size)]
+        size, corners = self.options.shadow_map_size, self._on_device.corners
+        views = [v for light in lights for v in shadow_map.cameras(corners, light, size)]
         maps.lights = lights
         maps.views.aim(views, taken=self._taken, frustum=self._skips.frustum)
         for call in maps.draw:
             call()
         return True
 
+    def _views(self, count: int) -> DeviceViews:
+        return DeviceViews(self._on_device.geometry.mesh, count, cut_room=self._cut_room)
+
     def _make_maps(self, sizes: tuple[tuple[int, ...], ...]) -> "_Maps":
         sides = [side for of_light in sizes for side in of_light]
-        views = DeviceViews(self._device.mesh, len(sides), cut_room=self._cut_room)
         # Empty from the start: where layers find no room a tile stays as it was, and the frame is drawn again.
         texels = opencl.upload(np.full((sum(side * side for side in sides), 2), -1, np.int32))
-        scene, capacity = self._device, np.int32(self._taken + self._extra)
-        draw = [
+        empty = [opencl.upload(np.zeros((-(-side // 4)) ** 2, np.uint8)) for side in sides]
+        faces = [len(of_light) for of_light in sizes]
+        maps = _Maps(views=self._views(len(sides)), texels=texels, empty=empty, sizes=sizes, faces=faces)
+        maps.draw = self._map_calls(maps)
+        return maps
+
+    def _map_calls(self, maps: "_Maps") -> list[opencl.Call]:
+        """Return the calls that draw each map."""
+        views, geometry, materials = maps.views, self._on_device.geometry, self._on_device.materials
+        capacity = np.int32(self._taken + self._extra)
+        return [
             opencl.Call(
                 "render/shadow_map.cl", "draw_light", (self._workers,), (1,),
                 (views.views, views.triangles, views.slots, views.labels, views.boxes, views.coarse, views.counters,
-                 scene.records, scene.facets, scene.tables, scene.mdfs, np.int32(number),
-                 np.int32(views.stride), capacity, np.int32(self._skip_bits()), *self._layers(), texels,
-                 opencl.upload(np.zeros((-(-side // 4)) ** 2, np.uint8))),
+                 geometry.records, geometry.facets, materials.tables, materials.mdfs, np.int32(number),
+                 np.int32(views.stride), capacity, np.int32(self._skip_bits()), *self._layers(), maps.texels, empty),
                 self._defines,
             )
-            for number, side in enumerate(sides)
+            for number, empty in enumerate(maps.empty)
         ]  # fmt: skip
-        faces = [len(of_light) for of_light in sizes]
-        return _Maps(views=views, texels=texels, draw=draw, sizes=sizes, faces=faces)
 
     def _draw_picture(self, picture: "_Picture", lights: tuple[Light, ...], outputs: int) -> None:
         """Draw the picture of the camera it is aimed with."""
-        scene, maps = self._scene, self._maps
+        scene, maps = self._on_device.scene, self._maps
         if picture.shone is not lights:
             records = picture.lights.array
             records[: max(len(lights), 1)] = device.light_records(lights)
@@ -256,24 +302,56 @@ class Renderer:
         shadowed = torch.zeros(max(n_light, 1), rows, pitch, dtype=torch.uint8)
         shown = torch.zeros(rows, pitch, 4, dtype=torch.uint8)
         results = [(opencl.buffer(x), x) for x in (shown, rgba, depth, owner, shadowed)]
-        views = DeviceViews(self._device.mesh, 1, cut_room=self._cut_room)
         lights = opencl.Shared(np.zeros(max(n_light, 1), device.LIGHT))
         frame, empty = opencl.Shared(np.zeros(1, FRAME)), opencl.Shared(np.zeros(rows * pitch // 16, np.uint8))
-        scene, light = self._device, self._maps
-        shadows = (
-            (light.views.views, light.views.slots, light.texels) if light else (views.views, views.slots, views.slots)
-        )
-        draw = opencl.Call(
-            "render/renderer.cl", "draw", (self._workers,), (1,),
-            (views.views, views.triangles, views.slots, views.labels, views.boxes, views.coarse, views.counters,
-             scene.records, scene.facets, scene.tables, scene.mdfs, scene.reflectances,
-             lights.buffer, *shadows, frame.buffer, *self._layers(), *(b for b, _ in results), empty.buffer),
-            self._defines,
-        )  # fmt: skip
-        return _Picture(
-            key=key, views=views, results=results, lights=lights, frame=frame, empty=empty, draw=draw,
+        picture = _Picture(
+            key=key, views=self._views(1), results=results, lights=lights, frame=frame, empty=empty,
             shown=shown, rgba=rgba, depth=depth, owner=owner, shadowed=shadowed,
         )  # fmt: skip
+        picture.draw = self._picture_call(picture)
+        return picture
+
+    def _picture_call(self, picture: "_Picture") -> opencl.Call:
+        """Return the call that draws a picture."""
+        geometry, materials = self._on_device.geometry, self._on_device.materials
+        maps, views = self._maps, picture.views
+        shadows = (maps.views.views, maps.views.slots, maps.texels) if maps else (views.views, views.slots, views.slots)
+        return opencl.Call(
+            "render/renderer.cl", "draw", (self._workers,), (1,),
+            (views.views, views.triangles, views.slots, views.labels, views.boxes, views.coarse, views.counters,
+             geometry.records, geometry.facets, materials.tables, materials.mdfs, materials.reflectances,
+             picture.lights.buffer, *shadows, picture.frame.buffer, *self._layers(),
+             *(b for b, _ in picture.results), picture.empty.buffer),
+            self._defines,
+        )  # fmt: skip
+
+
+class _OnDevice(NamedTuple):
+    """A scene and its side on the device."""
+
+    scene: Scene
+    geometry: device.DeviceGeometry
+    materials: device.DeviceMaterials
+    corners: Float[np.ndarray, "3 V"]  # see `shadow_map.cameras`
+
+    def since(self, before: "_OnDevice | None") -> dict[str, int]:
+        """Return what was uploaded that was not there before."""
+        meshes = before is None or self.geometry is not before.geometry
+        return {"faces uploaded": self.geometry.mesh.n_face * meshes, "tables uploaded": self.materials.packed}
+
+
+def _upload(scene: Scene, options: FrameOptions, before: _OnDevice | None = None) -> _OnDevice:
+    """Return `scene` on the device, with what it shares with the one before."""
+    materials = device.upload_materials(
+        [o.material for o in scene.objects],
+        silhouettes=options.silhouette != "none",
+        ambient=scene.ambient > 0,
+        before=None if before is None else before.materials,
+    )
+    if before is not None and _are(_meshes(scene), _meshes(before.scene)):
+        return before._replace(scene=scene, materials=materials)
+    world = assemble(scene)
+    return _OnDevice(scene, device.upload_geometry(world), materials, shadow_map.corners_of(world))
 
 
 @dataclass(eq=False, kw_only=True)
@@ -282,10 +360,11 @@ class _Maps:
 
     views: DeviceViews
     texels: "opencl.Buffer"
-    draw: list[opencl.Call]
+    empty: "list[opencl.Buffer]"  # which stamps of a map show nothing
+    draw: list[opencl.Call] = field(init=False)
     sizes: tuple[tuple[int, ...], ...]  # sides of the faces of each light
     faces: list[int]
-    lights: tuple[Light, ...] = ()
+    lights: tuple[Light, ...] | None = None  # that they were drawn for
 
 
 @dataclass(eq=False, kw_only=True)
@@ -298,7 +377,7 @@ class _Picture:
     lights: opencl.Shared
     frame: opencl.Shared
     empty: opencl.Shared
-    draw: opencl.Call
+    draw: opencl.Call = field(init=False)
     shown: Tensor
     rgba: Tensor
     depth: Tensor
@@ -322,6 +401,19 @@ class _Picture:
             counts=counts,
             seconds=seconds,
         )
+
+
+def _meshes(scene: Scene) -> list[object]:
+    return [o.mesh for o in scene.objects]
+
+
+def _depths(scene: Scene) -> list[object]:
+    return [o.material.mdf for o in scene.objects]
+
+
+def _are(a: list[object], b: list[object]) -> bool:
+    """Return whether two lists hold the same objects."""
+    return len(a) == len(b) and all(map(operator.is_, a, b))
 
 
 def _same(a: tuple[Light, ...], b: tuple[Light, ...]) -> bool:
