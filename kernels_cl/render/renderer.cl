@@ -12,7 +12,8 @@ typedef struct {
     int lights, ambient_paper, depths, outputs;  // outputs: OWNER also writes depth, objects and shadows
     int capacity, skips, stride, pitch;  // pitch: pixels of a row of the picture
     float ambient, background[3], rank_error;
-    int pad[3];
+    float pixel;  // world width of what a pixel averages, at view depth 1 in perspective; 0 = nothing is averaged
+    int pad[2];
 } Frame;
 #define OWNER 1
 #define DISPLAY 2  // writes bytes to be shown, and nothing else
@@ -87,12 +88,21 @@ static void shade_object(const Place *place, __global const Reflectance *reflect
     const Vector3 wo = to_local(&seen->at, towards);
     const float4 albedo = {reflectance->albedo[0], reflectance->albedo[1], reflectance->albedo[2], 0.0f};
     Footprint view;
-    Taps taps;
+    Area area;
     Weights first;
     float4 T[16];
     if (reflectance->there) {
         view = footprint(TABLE(Ring, tables, reflectance->view_rings), reflectance->view_count, wo);
-        taps = bilinear(seen->at.u, seen->at.v, reflectance->height, reflectance->width);
+        if (frame->pixel > 0.0f) {
+            const Vector3 from_eye = {seen->position.x - rays->origin.x, seen->position.y - rays->origin.y,
+                                      seen->position.z - rays->origin.z};
+            const float16 depth = dot3(from_eye, rays->direction) / rays->stretch;
+            const float16 pixel = place->view->perspective ? frame->pixel * depth : (float16)frame->pixel;
+            look_around(TABLE(Level, tables, reflectance->levels), reflectance->level_count, seen->at.u, seen->at.v, wo,
+                        MAX(pixel, (float16)0.0f) / seen->at.scale, bits, &area);
+        } else {
+            look_at_point(seen->at.u, seen->at.v, reflectance->height, reflectance->width, bits, &area);
+        }
         first = view_weights(tables, reflectance, 0, &view, bits);
     }
     int lit = 0;
@@ -120,7 +130,7 @@ static void shade_object(const Place *place, __global const Reflectance *reflect
         float16 horizon = wi.z / reflectance->last_cosine;
         horizon = horizon > 1.0f ? 1.0f : horizon;
         const Floats arriving = {falloff * horizon * (1.0f / PI)};
-        reflect(tables, reflectance, frame->rank_error, &view, &first, &taps, &from, arrives, T,
+        reflect(tables, reflectance, frame->rank_error, &view, &first, &area, &from, arrives, T,
                 &tally->spared);
         for (int b = arrives; b; b &= b - 1) {
             const int l = __builtin_ctz(b);
@@ -134,24 +144,16 @@ static void shade_object(const Place *place, __global const Reflectance *reflect
         for (int b = dark; b; b &= b - 1) rgb[__builtin_ctz(b)] += frame->ambient * albedo;
         return;
     }
-    reflect_ambient(tables, reflectance, &view, &first, &taps, dark, T);
+    reflect_ambient(tables, reflectance, &view, &first, &area, dark, T);
     for (int b = dark; b; b &= b - 1) rgb[__builtin_ctz(b)] += frame->ambient * not_negative(T[__builtin_ctz(b)]);
 }
 
-// Four colours as they are shown: exposure 0, clipped, sRGB, as data/image.py does; log2 and 2^x are polynomials.
+// Four colours as they are shown: exposure 0, clipped, sRGB, as data/image.py does; 2^x is a polynomial.
 static uchar16 encode(const float16 colour)
 {
     float16 x = colour > 0.0f ? colour : (float16)0.0f;
     x = x < 1.0f ? x : (float16)1.0f;
-    const int16 bits = as_int16(x + 1e-9f);
-    const float16 m = as_float16((bits & 0x7fffff) | 0x3f800000) - 1.0f;
-    float16 log2 = -0.0248255360f;
-    log2 = log2 * m + 0.1179165680f;
-    log2 = log2 * m - 0.2723536420f;
-    log2 = log2 * m + 0.4538504450f;
-    log2 = log2 * m - 0.7169698550f;
-    log2 = log2 * m + 1.4423896250f;
-    log2 = (TO_FLOAT((bits >> 23) - 127) + m * log2) * (1.0f / 2.4f);
+    const float16 log2 = log2_(x + 1e-9f) * (1.0f / 2.4f);
     const int16 whole = TO_INT(log2 - 0.5f);
     const float16 f = log2 - TO_FLOAT(whole);
     float16 exp2 = 1.8775767e-3f;

@@ -140,3 +140,30 @@ def test_bad_models_are_refused(tmp_path, rng):
     store.write_model(tmp_path / "a.meso", {"x": torch.ones(1)}, {"kind": "other"})
     with pytest.raises(FormatError, match="expected an eigen BTF, found x"):
         eigen_btf.load(tmp_path / "a.meso")
+
+
+def test_seen_from_afar_a_texture_is_its_mean(rng):
+    """A pixel over many tiles shows the mean of all texels, whatever light and view."""
+    from torchmeso.data import pyramid
+
+    eigen = make(rng)
+    table = full_table(eigen).mean((2, 3))
+    l, v = 7, 9
+    wi, wo = (d.directions(torch.float64)[i].expand(20, 3) for d, i in ((LIGHTS, l), (VIEWS, v)))
+    uv = torch.rand(20, 2, dtype=torch.float64, generator=rng)
+    seen = pyramid.footprint(wo, torch.full((20,), 5.0, dtype=torch.float64))
+    torch.testing.assert_close(eigen.evaluate(uv, wi, wo, seen), table[l, v].expand(20, 3), **FLOAT64)
+    share = hemisphere.quadrature(LIGHTS).double() / math.pi
+    mean = torch.einsum("lc,l->c", table[:, v], share)
+    torch.testing.assert_close(eigen.ambient(uv, wo, seen), mean.expand(20, 3), rtol=1e-5, atol=1e-6)
+
+
+def test_seen_from_near_a_texture_is_read_at_the_point(rng):
+    from torchmeso.data import pyramid
+
+    eigen = make(rng)
+    uv = torch.rand(30, 2, dtype=torch.float64, generator=rng)
+    wi, wo = normalize(torch.rand(2, 30, 3, dtype=torch.float64, generator=rng) + 0.3).unbind(0)
+    seen = pyramid.footprint(wo, torch.full((30,), 0.01, dtype=torch.float64))
+    torch.testing.assert_close(eigen.evaluate(uv, wi, wo, seen), eigen.evaluate(uv, wi, wo), **FLOAT64)
+    torch.testing.assert_close(eigen.ambient(uv, wo, seen), eigen.ambient(uv, wo), **FLOAT64)

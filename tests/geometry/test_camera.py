@@ -63,3 +63,33 @@ def test_bad_cameras_are_refused():
         camera("perspective", near=0.0)
     with pytest.raises(ConfigError, match="fov_deg: expected a value from"):
         camera("perspective", fov_deg=180.0)
+
+
+@pytest.mark.parametrize("projection", ["perspective", "orthographic"])
+def test_a_shifted_camera_sees_the_places_beside_the_centres(projection, rng):
+    plain, shifted = camera(projection), camera(projection, shift=(0.25, -0.4))
+    xy = torch.rand(50, 2, dtype=torch.float64, generator=rng) * 40
+    for a, b in zip(shifted.rays(xy), plain.rays(xy + torch.tensor([0.25, -0.4], dtype=torch.float64)), strict=True):
+        torch.testing.assert_close(a, b, **FLOAT64)
+    points = torch.randn(50, 3, dtype=torch.float64, generator=rng) * 0.3
+    a, b = shifted.project(points), plain.project(points)
+    places = [x[:, :2] / x[:, 2:3] for x in (a, b)]
+    torch.testing.assert_close(places[0] + torch.tensor([0.25, -0.4], dtype=torch.float64), places[1], **FLOAT64)
+
+
+def test_jittered_cameras_fill_a_pixel_evenly():
+    shifts = [c.shift for c in camera("perspective").jittered(4)]
+    assert len(set(shifts)) == 16
+    for axis in (0, 1):
+        assert sorted({s[axis] for s in shifts}) == [-0.375, -0.125, 0.125, 0.375]
+
+
+def test_width_of_a_pixel(rng):
+    """What lies a pixel apart on the screen lies so far apart across the line of sight."""
+    view = camera("perspective")
+    points = view.eye - 3.0 * view.axes[2] + 0.2 * torch.randn(20, 3, dtype=torch.float64, generator=rng)
+    width = view.pixel_width(points)
+    a, b = view.project(points), view.project(points + width[:, None] * view.axes[0])
+    torch.testing.assert_close(b[:, 0] / b[:, 2] - a[:, 0] / a[:, 2], torch.ones(20, dtype=torch.float64), **FLOAT64)
+    flat = camera("orthographic", view_height=2.0)
+    assert (flat.pixel_width(points) == 2.0 / 48).all()

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -33,6 +35,27 @@ def test_png_is_srgb(tmp_path, rng):
     p = picture(rng)
     film.write(p, tmp_path / "a.png")
     assert (image.read(tmp_path / "a.png") - p.rgb).abs().max() < 0.01
+
+
+def test_the_mean_of_pictures(rng):
+    """Colours are averaged; what cannot be is the first picture's, also where the next is drawn over it."""
+    pictures = [replace(picture(rng), seconds={"frame": 1.0}) for _ in range(3)]
+    shared = pictures[0].depth.clone()
+
+    def paint(number):
+        shared.copy_(pictures[number].depth)
+        return replace(pictures[number], depth=shared)
+
+    mean = film.average(paint, range(3))
+    torch.testing.assert_close(mean.rgb, torch.stack([p.rgb for p in pictures]).mean(0))
+    assert torch.equal(mean.depth, pictures[0].depth)
+    assert mean.seconds == {"frame": 3.0}
+
+
+@pytest.mark.errors
+def test_no_picture_has_no_mean():
+    with pytest.raises(ConfigError, match="expected at least one camera"):
+        film.average(lambda camera: None, [])
 
 
 @pytest.mark.errors

@@ -252,6 +252,29 @@ def test_a_scene_that_cannot_be_read_leaves_the_one_before(still_life, device):
     assert torch.equal(renderer.render(view).rgb, before)
 
 
+@pytest.mark.parametrize("filtering", [True, False])
+def test_what_lies_far_away(filtering, brick, device):
+    """A floor to the horizon: many texels to a pixel, long ones at the far end."""
+    floor = shapes.plane(size=(60.0, 60.0), tiles=(60, 60))
+    scene = Scene(objects=(Object(mesh=floor, material=brick),), lights=LIGHTS["sun"])
+    view = camera((0.3, 1.0, 25.0), at=(0.0, 0.0, 10.0), size=96)
+    wrong = compare(scene, view, FrameOptions(shadows=False, filtering=filtering))[2]
+    assert wrong <= 4
+
+
+@pytest.mark.parametrize("projection", ["perspective", "orthographic"])
+def test_jittered_frames(projection, still_life, device):
+    scene = Scene(objects=still_life, lights=LIGHTS["spot"])
+    view = camera((1.5, 2.0, 3.5), size=64, projection=projection, view_height=4.0)
+    options = FrameOptions(shadow_map_size=128, antialias=2)
+    assert compare(scene, view, options)[2] <= 8
+    single = replace(options, antialias=1, filtering=False)
+    renderer, shown = Renderer(scene, single), Renderer(scene, replace(options, filtering=False))
+    mean = torch.stack([renderer.render(c).rgb.double() for c in view.jittered(2)]).mean(0)
+    torch.testing.assert_close(shown.render(view).rgb.double(), mean, atol=1e-6, rtol=1e-6)
+    assert (shown.show(view)[..., :3].float() / 255).pow(2.2).sub(mean.clamp(0, 1)).abs().mean() < 0.02
+
+
 def test_what_kernels_cannot_read(device):
     objects = (Object(mesh=shapes.sphere(triangles=100), material=Material(mdf=RayCastMdf(generators.sheet()))),)
     with pytest.raises(BackendError, match="expected an MDF of 8 bits, got RayCastMdf"):

@@ -19,6 +19,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchmeso.data import address, store
+from torchmeso.data.pyramid import Footprint
 from torchmeso.errors import FormatError, ShapeError, check_shape
 from torchmeso.geometry import hemisphere
 from torchmeso.geometry.hemisphere import DirectionSet
@@ -29,12 +30,18 @@ class Evaluable(Protocol):
     """Anything that shading can ask for reflectance: `Btf`, `EigenBtf`."""
 
     def evaluate(
-        self, uv: Float[Tensor, "*batch 2"], wi: Float[Tensor, "*batch 3"], wo: Float[Tensor, "*batch 3"]
+        self,
+        uv: Float[Tensor, "*batch 2"],
+        wi: Float[Tensor, "*batch 3"],
+        wo: Float[Tensor, "*batch 3"],
+        seen: Footprint | None = None,
     ) -> Float[Tensor, "*batch 3"]:
-        """Return T(uv, wi, wo), linear RGB; local frame, 0 for wi below the horizon."""
+        """Return T(uv, wi, wo), linear RGB; local frame, 0 for wi below the horizon; a mean over what is `seen`."""
         ...
 
-    def ambient(self, uv: Float[Tensor, "*batch 2"], wo: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+    def ambient(
+        self, uv: Float[Tensor, "*batch 2"], wo: Float[Tensor, "*batch 3"], seen: Footprint | None = None
+    ) -> Float[Tensor, "*batch 3"]:
         """Return L_a(uv, wo) = (1/pi) times the integral of T over the light hemisphere (white: 1)."""
         ...
 
@@ -89,13 +96,22 @@ class Btf:
         return torch.from_numpy(np.asarray(self.images[:]))
 
     def evaluate(
-        self, uv: Float[Tensor, "*batch 2"], wi: Float[Tensor, "*batch 3"], wo: Float[Tensor, "*batch 3"]
+        self,
+        uv: Float[Tensor, "*batch 2"],
+        wi: Float[Tensor, "*batch 3"],
+        wo: Float[Tensor, "*batch 3"],
+        seen: Footprint | None = None,
     ) -> Float[Tensor, "*batch 3"]:
         """Return T(uv, wi, wo): 4 lights x 4 views x 4 texels, C0 everywhere, 0 for wi below the horizon."""
         light = hemisphere.interpolate(self.lights, wi)
         return self._sum_taps(uv, wo, light.node, light.weight, self._nodes) * horizon_falloff(self.lights, wi)
 
-    def ambient(self, uv: Float[Tensor, "*batch 2"], wo: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+    def ambient(
+        self,
+        uv: Float[Tensor, "*batch 2"],
+        wo: Float[Tensor, "*batch 3"],
+        seen: Footprint | None = None,
+    ) -> Float[Tensor, "*batch 3"]:
         """Return L_a(uv, wo) = (1/pi) times the integral of T over the light hemisphere (white: 1)."""
         zero = torch.zeros_like(uv[..., :1], dtype=torch.long)
         return self._sum_taps(uv, wo, zero, torch.ones_like(uv[..., :1]), self._ambient_nodes)

@@ -9,6 +9,7 @@ Test: tests/data/test_eigen_btf.py
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,9 +18,10 @@ import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor
 
-from torchmeso.data import address, mdf, store
+from torchmeso.data import address, mdf, pyramid, store
 from torchmeso.data.btf import horizon_falloff
 from torchmeso.data.mdf import Mdf
+from torchmeso.data.pyramid import Footprint
 from torchmeso.errors import FormatError, ShapeError, check_shape
 from torchmeso.geometry import hemisphere
 from torchmeso.geometry.hemisphere import DirectionSet
@@ -77,7 +79,11 @@ class EigenBtf:
         )
 
     def evaluate(
-        self, uv: Float[Tensor, "*batch 2"], wi: Float[Tensor, "*batch 3"], wo: Float[Tensor, "*batch 3"]
+        self,
+        uv: Float[Tensor, "*batch 2"],
+        wi: Float[Tensor, "*batch 3"],
+        wo: Float[Tensor, "*batch 3"],
+        seen: Footprint | None = None,
     ) -> Float[Tensor, "*batch 3"]:
         """Return T(uv, wi, wo), linear RGB: 4 lights x 4 texels of E, 4 views of W; C0, differentiable.
 
@@ -85,22 +91,35 @@ class EigenBtf:
             uv: (..., 2) texture coordinates, unbounded.
             wi: (..., 3) unit direction to the light, local frame; T = 0 below the horizon.
             wo: (..., 3) unit direction to the viewer, local frame; held below the last ring.
+            seen: what is to be averaged over, of (n, 2) uv; None = the point.
 
         Returns:
             (..., 3); a low rank can make it slightly negative, which is left to the caller.
         """
-        height, width = self.texels
-        taps = address.bilinear(uv, height, width)
         light = hemisphere.interpolate(self.lights, wi)
-        index = (light.node[..., :, None] * (height * width) + taps.texel[..., None, :]).flatten(-2)
-        tap_weight = (light.weight[..., :, None] * taps.weight[..., None, :]).flatten(-2)
-        return self._combine(self._nodes[index], tap_weight, wo) * horizon_falloff(self.lights, wi)
 
-    def ambient(self, uv: Float[Tensor, "*batch 2"], wo: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        def look_up(which: Tensor, uv: Tensor, level: int) -> Tensor:
+            height, width = self.levels[level].shape[1:3]
+            taps = address.bilinear(uv, height, width)
+            node, share = light.node[which], light.weight[which]
+            index = (node[..., :, None] * (height * width) + taps.texel[..., None, :]).flatten(-2)
+            weight = (share[..., :, None] * taps.weight[..., None, :]).flatten(-2)
+            return (self._nodes[level][index].to(uv.dtype) * weight[..., None, None]).sum(-3)
+
+        E = self.offset.to(wo.dtype) + self.scale.to(wo.dtype) * self._mean(look_up, uv, seen)
+        return self._weighted(E, wo) * horizon_falloff(self.lights, wi)
+
+    def ambient(
+        self, uv: Float[Tensor, "*batch 2"], wo: Float[Tensor, "*batch 3"], seen: Footprint | None = None
+    ) -> Float[Tensor, "*batch 3"]:
         """Return L_a(uv, wo) = (1/pi) times the integral of T over the light hemisphere (white: 1)."""
-        taps = address.bilinear(uv, *self.texels)
-        E = (self.ambient_maps[taps.texel].to(uv.dtype) * taps.weight[..., None, None]).sum(-3)
-        return (E * self.view_weights(wo).unsqueeze(-1)).sum(-2)
+
+        def look_up(which: Tensor, uv: Tensor, level: int) -> Tensor:
+            E = self.ambient_maps[level]
+            taps = address.bilinear(uv, *E.shape[:2])
+            return (E.flatten(0, 1)[taps.texel].to(uv.dtype) * taps.weight[..., None, None]).sum(-3)
+
+        return self._weighted(self._mean(look_up, uv, seen), wo)
 
     def view_weights(self, wo: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch rank"]:
         """Return W(wo), interpolated."""
@@ -111,28 +130,45 @@ class EigenBtf:
         """Return the eigen maps E as floating-point values."""
         return _decode(self.maps, self.scale, self.offset)
 
-    def _combine(self, codes: Tensor, tap_weight: Tensor, wo: Tensor) -> Tensor:
-        mean = (codes.to(wo.dtype) * tap_weight[..., None, None]).sum(-3)
-        E = self.offset.to(wo.dtype) + self.scale.to(wo.dtype) * mean
+    def _mean(
+        self, look_up: Callable[[Tensor, Tensor, int], Tensor], uv: Tensor, seen: Footprint | None
+    ) -> Float[Tensor, "*batch rank 3"]:
+        """Return what `look_up` (which points, uv, level) finds over the area that is seen."""
+        everywhere = torch.ones(uv.shape[:-1], dtype=torch.bool)
+        if seen is None:
+            return look_up(everywhere, uv.reshape(-1, 2), 0).reshape(*uv.shape[:-1], self.rank, 3)
+        mean = torch.zeros(*uv.shape[:-1], self.rank, 3, dtype=uv.dtype)
+        for probe in pyramid.probes(uv, seen, max(self.texels), len(self.levels)):
+            for level in probe.level.unique().tolist():
+                which = (probe.level == level) & (probe.weight > 0)
+                mean[which] += probe.weight[which][..., None, None] * look_up(which, probe.uv[which], level)
+        return mean
+
+    def _weighted(self, E: Tensor, wo: Tensor) -> Tensor:
         return (E * self.view_weights(wo).unsqueeze(-1)).sum(-2)
 
     @cached_property
-    def _nodes(self) -> Tensor:
-        """(nodes of light x texel, rank, 3) codes, the pole appended."""
-        return hemisphere.with_pole(self.maps, self.lights).flatten(0, 2).contiguous()
+    def levels(self) -> list[Shaped[Tensor, "light H2 W2 rank 3"]]:
+        """The maps, and their means over ever more texels."""
+        return pyramid.build(self.maps, 1)
+
+    @cached_property
+    def _nodes(self) -> list[Tensor]:
+        """(nodes of light x texel, rank, 3) codes of each level, the pole appended."""
+        return [hemisphere.with_pole(maps, self.lights).flatten(0, 2).contiguous() for maps in self.levels]
 
     @cached_property
     def _weight_nodes(self) -> Tensor:
         return hemisphere.with_pole(self.weights, self.views)
 
     @cached_property
-    def ambient_maps(self) -> Float[Tensor, "texel rank 3"]:
-        """E integrated over the light hemisphere, over pi."""
+    def ambient_maps(self) -> list[Float[Tensor, "H2 W2 rank 3"]]:
+        """E integrated over the light hemisphere, over pi; each level of the pyramid."""
         share = (hemisphere.quadrature(self.lights) / math.pi).to(self.scale.dtype)
         total = torch.zeros(self.maps.shape[1:], dtype=self.scale.dtype)
         for l in range(len(self.lights)):
             total += share[l] * _decode(self.maps[l], self.scale, self.offset)
-        return total.flatten(0, 1)
+        return pyramid.build(total, 0)
 
 
 def _decode(codes: Tensor, scale: Tensor, offset: Tensor) -> Tensor:

@@ -8,7 +8,8 @@ Test: tests/geometry/test_camera.py
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
@@ -34,6 +35,7 @@ class Camera:
         width: pixels.
         height: pixels.
         near: view depth below which nothing is drawn, world units.
+        shift: where rays pass through a pixel, in pixels right and down of its centre.
     """
 
     eye: Float[Tensor, "3"]
@@ -44,6 +46,7 @@ class Camera:
     width: int = 800
     height: int = 600
     near: float = 1e-3
+    shift: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
         """Raise ShapeError or ConfigError for values no picture can be made with."""
@@ -72,8 +75,9 @@ class Camera:
         x, y, back = (a * row[0] + b * row[1] + c * row[2] for row in self.axes.to(points.dtype))
         depth = -back
         w = depth if self.projection == "perspective" else torch.ones_like(depth)
-        size = self.pixel_size
-        return torch.stack([x / size + w * (self.width / 2), -y / size + w * (self.height / 2), w, depth], -1)
+        size, (right, down) = self.pixel_size, self.shift
+        x, y = x / size + w * (self.width / 2 - right), -y / size + w * (self.height / 2 - down)
+        return torch.stack([x, y, w, depth], -1)
 
     def rays(
         self, xy: Float[Tensor, "*batch 2"]
@@ -87,8 +91,8 @@ class Camera:
             origin (..., 3) on the plane of the eye, direction (..., 3), and stretch (...): t = depth * stretch.
         """
         size = self.pixel_size
-        x = (xy[..., 0] - self.width / 2) * size
-        y = (self.height / 2 - xy[..., 1]) * size
+        x = (xy[..., 0] - (self.width / 2 - self.shift[0])) * size
+        y = (self.height / 2 - self.shift[1] - xy[..., 1]) * size
         right, up, back = self.axes.to(xy.dtype).unbind(0)
         offset = x.unsqueeze(-1) * right + y.unsqueeze(-1) * up
         eye = self.eye.to(xy.dtype)
@@ -96,6 +100,19 @@ class Camera:
             return eye + offset, (-back).expand_as(offset), torch.ones_like(x)
         stretch = torch.sqrt(1 + x.square() + y.square())
         return eye.expand_as(offset), (offset - back) / stretch.unsqueeze(-1), stretch
+
+    def pixel_width(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        """Return how wide a pixel is at `points`, across the line of sight, in world units."""
+        if self.projection == "orthographic":
+            return torch.full_like(points[..., 0], self.pixel_size)
+        depth = -((points - self.eye.to(points.dtype)) * self.axes[2].to(points.dtype)).sum(-1)
+        return depth.clamp(min=0) * self.pixel_size
+
+    def jittered(self, n: int) -> Iterator["Camera"]:
+        """Yield n x n cameras whose rays stand in a regular grid in every pixel."""
+        for row in range(n):
+            for column in range(n):
+                yield replace(self, shift=((column + 0.5) / n - 0.5, (row + 0.5) / n - 0.5))
 
     def pixel_centres(self, dtype: torch.dtype = torch.float32) -> Float[Tensor, "height width 2"]:
         """Return the (height, width, 2) centres of all pixels."""

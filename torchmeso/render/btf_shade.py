@@ -14,13 +14,19 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchmeso.data.pyramid import Footprint, footprint
 from torchmeso.geometry import frames
 from torchmeso.geometry.light import illuminate
 from torchmeso.render.scene import Material, Points, Scene
 
 
 def shade(
-    scene: Scene, points: Points, wo_world: Float[Tensor, "n 3"], shadowed: Bool[Tensor, "light n"]
+    scene: Scene,
+    points: Points,
+    wo_world: Float[Tensor, "n 3"],
+    shadowed: Bool[Tensor, "light n"],
+    *,
+    samples: int | None = 1,
 ) -> Float[Tensor, "n 3"]:
     """Return the linear RGB radiance of `points` towards `wo_world`.
 
@@ -29,6 +35,7 @@ def shade(
         points: where, on the base surface.
         wo_world: (n, 3) unit, to the viewer.
         shadowed: (light, n) whether a light is blocked.
+        samples: along a side of a pixel, which share what it covers of a texture; None = textures are not filtered.
     """
     total = torch.zeros_like(points.position)
     lit = torch.zeros(len(total), dtype=torch.bool)
@@ -38,28 +45,31 @@ def shade(
         wi = frames.to_local(points.frame, wi_world)
         arrives = (~blocked & (wi[:, 2] > 0) & (E.amax(-1) > 0)).nonzero()[:, 0]
         lit[arrives] = True
-        T = _per_material(scene, points.select(arrives), wi[arrives], wo[arrives])
+        T = _per_material(scene, points.select(arrives), wi[arrives], wo[arrives], samples)
         total[arrives] += E[arrives] * T / math.pi
     dark = ~lit if scene.ambient_rule == "paper" else torch.ones_like(lit)
     which = dark.nonzero()[:, 0]
     if scene.ambient > 0 and len(which):
-        total[which] += scene.ambient * _per_material(scene, points.select(which), None, wo[which])
+        total[which] += scene.ambient * _per_material(scene, points.select(which), None, wo[which], samples)
     return total
 
 
-def _per_material(scene: Scene, points: Points, wi: Tensor | None, wo: Tensor) -> Tensor:
+def _per_material(scene: Scene, points: Points, wi: Tensor | None, wo: Tensor, samples: int | None) -> Tensor:
     """Return T, or L_a where `wi` is None; a low-rank model's negative values become 0."""
     result = torch.zeros_like(points.position)
     for i, item in enumerate(scene.objects):
         mine = (points.owner == i).nonzero()[:, 0]
         if len(mine):
             from_light = None if wi is None else wi[mine]
-            result[mine] = _reflect(item.material, points.uv[mine], from_light, wo[mine])
+            seen = None
+            if samples is not None:
+                seen = footprint(wo[mine], points.pixel[mine] / (points.scale[mine] * samples))
+            result[mine] = _reflect(item.material, points.uv[mine], from_light, wo[mine], seen)
     return result.clamp(min=0)
 
 
-def _reflect(material: Material, uv: Tensor, wi: Tensor | None, wo: Tensor) -> Tensor:
+def _reflect(material: Material, uv: Tensor, wi: Tensor | None, wo: Tensor, seen: Footprint | None) -> Tensor:
     if material.btf is not None:
-        return material.btf.ambient(uv, wo) if wi is None else material.btf.evaluate(uv, wi, wo)
+        return material.btf.ambient(uv, wo, seen) if wi is None else material.btf.evaluate(uv, wi, wo, seen)
     albedo = torch.tensor(material.albedo, dtype=uv.dtype)
     return albedo.expand(len(uv), 3) if wi is None else albedo * wi[:, 2:].clamp(min=0)

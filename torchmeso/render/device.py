@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, UInt8, UInt16
+from jaxtyping import Bool, Float, Int, Int32, UInt8, UInt16
 from torch import Tensor
 
 from torchmeso.backends import opencl
@@ -44,7 +44,8 @@ FACET = np.dtype(
 REFLECTANCE = np.dtype(
     [(name, "i4") for name in ("there", "height", "width", "groups", "codes", "light_rings", "light_count")]
     + [(name, "i4") for name in ("view_rings", "view_count", "maps", "weights", "scale", "offset", "ambient")]
-    + [("last_cosine", "f4"), ("albedo", "f4", 3), ("pad", "i4", 14)]
+    + [("levels", "i4"), ("level_count", "i4")]
+    + [("last_cosine", "f4"), ("albedo", "f4", 3), ("pad", "i4", 12)]
 )
 
 MDF = np.dtype(
@@ -61,7 +62,7 @@ LIGHT = np.dtype(
 
 
 ADDRESSES = {
-    REFLECTANCE: ("light_rings", "view_rings", "maps", "weights", "scale", "offset", "ambient"),
+    REFLECTANCE: ("light_rings", "view_rings", "maps", "weights", "scale", "offset", "ambient", "levels"),
     MDF: ("rings", "delta", "missing", "relief", "plateau", "hole"),
 }
 """Fields that say on which block a table begins; -1 = there is none."""
@@ -253,7 +254,7 @@ def _reflectance(pool: "_Pool", btf: EigenBtf, *, ambient: bool) -> np.ndarray:
     groups = -(-btf.rank // GROUP)
     codes = btf.maps.dtype == torch.uint8
     height, width = btf.texels
-    maps = hemisphere.with_pole(btf.maps if codes else btf.maps.float(), btf.lights)
+    maps = [hemisphere.with_pole(x if codes else x.float(), btf.lights).flatten(0, 2) for x in btf.levels]
     weights = hemisphere.with_pole(btf.weights.float(), btf.views)
     scale, offset = _grouped(btf.scale.float()[None])[0], _grouped(btf.offset.float()[None])[0]
     by_channel = _grouped(weights[:, :, None].expand(-1, -1, 3))
@@ -262,12 +263,23 @@ def _reflectance(pool: "_Pool", btf: EigenBtf, *, ambient: bool) -> np.ndarray:
     record["codes"] = codes
     record["light_rings"], record["light_count"] = pool.add(_rings(btf.lights)), _ring_count(btf.lights)
     record["view_rings"], record["view_count"] = pool.add(_rings(btf.views)), _ring_count(btf.views)
-    record["maps"] = pool.add(_grouped(maps.flatten(0, 2)).numpy())
+    record["maps"] = pool.add(_grouped(torch.cat(maps)).numpy())
+    record["levels"], record["level_count"] = pool.add(_level_records(btf, [len(x) for x in maps])), len(maps)
     record["weights"], record["scale"], record["offset"] = (pool.add(x.numpy()) for x in (by_channel, scale, offset))
     if ambient:
-        record["ambient"] = pool.add(_grouped(btf.ambient_maps.float()).numpy())
+        ambient_maps = torch.cat([x.flatten(0, 1) for x in btf.ambient_maps])
+        record["ambient"] = pool.add(_grouped(ambient_maps.float()).numpy())
     record["last_cosine"] = math.cos(btf.lights.last)
     return record
+
+
+def _level_records(btf: EigenBtf, rows: list[int]) -> Int32[np.ndarray, "level 4"]:
+    """Return first vectors in the maps and in the ambient maps, height and width of each level."""
+    groups = -(-btf.rank // GROUP)
+    sizes = [tuple(x.shape[1:3]) for x in btf.levels]
+    first = groups * np.cumsum([0, *rows[:-1]])
+    ambient = groups * np.cumsum([0, *(h * w for h, w in sizes[:-1])])
+    return np.stack([first, ambient, *np.array(sizes).T], 1).astype(np.int32)
 
 
 def _bounds(btf: EigenBtf, weights: Float[Tensor, "view rank"]) -> Float[Tensor, "view group"]:

@@ -26,7 +26,7 @@ TRIANGLE_BYTES, SLOT_BYTES, LIMIT = 96, 64, 1 << 30
 """Sizes of the kernels' structures, and what no box reaches."""
 
 VIEW = np.dtype(
-    [("eye", "f8", 3), ("axes", "f8", (3, 3)), ("pixel_size", "f8"), ("near", "f8")]
+    [("eye", "f8", 3), ("axes", "f8", (3, 3)), ("pixel_size", "f8"), ("near", "f8"), ("shift", "f8", 2)]
     + [(name, "i4") for name in ("width", "height", "perspective", "slots", "texels", "frustum", "cull", "pad")]
 )
 """A camera as the kernels read it."""
@@ -197,7 +197,7 @@ class DeviceViews:
         texels, self.may_cut = 0, False
         for r, camera in zip(self._views.array, cameras, strict=True):
             r["eye"], r["axes"] = camera.eye.double().numpy(), camera.axes.double().numpy()
-            r["pixel_size"], r["near"] = camera.pixel_size, camera.near
+            r["pixel_size"], r["near"], r["shift"] = camera.pixel_size, camera.near, camera.shift
             r["width"], r["height"] = camera.width, camera.height
             r["perspective"] = camera.projection == "perspective"
             r["texels"], r["frustum"], r["cull"] = texels, frustum, cull

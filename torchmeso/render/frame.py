@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchmeso.errors import check_memory, check_range
 from torchmeso.geometry.camera import Camera
-from torchmeso.render import shadow_map
+from torchmeso.render import film, shadow_map
 from torchmeso.render.btf_shade import shade
 from torchmeso.render.film import Picture
 from torchmeso.render.rasterize import Layers, rasterize
@@ -65,6 +65,9 @@ class FrameOptions:
         shadow_map_size: texels along a side of a shadow map.
         rank_error: groups of four components of an eigen BTF are left out where they add at most this to T; the one
             skip that changes the picture, and only on opencl.
+        filtering: whether textures are averaged over what a pixel covers of them (data/pyramid); without, they are
+            read at a point, and what is far away flickers.
+        antialias: frames along a side of each pixel, n x n in all, whose rays are spread over it; 1 to 16.
         skips: what is left out without changing it; on opencl.
     """
 
@@ -72,12 +75,15 @@ class FrameOptions:
     shadows: bool = True
     shadow_map_size: int = 1024
     rank_error: float = 0.0
+    filtering: bool = True
+    antialias: int = 1
     skips: Skips = Skips()
 
     def __post_init__(self) -> None:
         """Raise ConfigError for a size out of range."""
         check_range("render.shadow_map_size", self.shadow_map_size, 8, 16384)
         check_range("render.rank_error", self.rank_error, 0, 1e6)
+        check_range("render.antialias", self.antialias, 1, 16)
 
 
 def render(scene: Scene, camera: Camera, options: FrameOptions | None = None) -> Picture:
@@ -87,6 +93,12 @@ def render(scene: Scene, camera: Camera, options: FrameOptions | None = None) ->
         SizeError: the picture would need more memory than the limit.
     """
     options = options or FrameOptions()
+    if options.antialias > 1:
+        return film.average(lambda c: _render(scene, c, options), camera.jittered(options.antialias))
+    return _render(scene, camera, options)
+
+
+def _render(scene: Scene, camera: Camera, options: FrameOptions) -> Picture:
     check_memory("render", camera.width * camera.height * 600.0, MEMORY_LIMIT, "render fewer pixels")
     seconds: dict[str, float] = {}
     with _timed(seconds, "assemble"):
@@ -100,7 +112,7 @@ def render(scene: Scene, camera: Camera, options: FrameOptions | None = None) ->
         first = nearest(candidates, candidates.depth)
         seen = Candidates(*(x[first] for x in candidates))
     with _timed(seconds, "shading"):
-        picture = _develop(scene, world, camera, layers, seen, maps)
+        picture = _develop(scene, world, camera, layers, seen, maps, options)
     return Picture(**picture, counts=_count(layers, counts, camera), seconds=seconds)
 
 
@@ -118,6 +130,7 @@ def _develop(
     layers: Layers,
     seen: Candidates,
     maps: list[shadow_map.ShadowMap],
+    options: FrameOptions,
 ) -> dict[str, Tensor]:
     """Shade what is seen and lay it out as a picture."""
     n_pixel = camera.width * camera.height
@@ -139,7 +152,8 @@ def _develop(
     for l, shadow in enumerate(maps):
         dark[l] = shadow_map.blocked(shadow, receiver)
     shadowed[:, pixel] = dark
-    rgb[pixel] = shade(scene, points, -direction, dark)
+    samples = options.antialias if options.filtering else None
+    rgb[pixel] = shade(scene, points, -direction, dark, samples=samples)
 
     size = (camera.height, camera.width)
     return {

@@ -262,7 +262,7 @@ def _spans(camera: Camera, tri: Triangles) -> _Spans:
 def _stretch(camera: Camera, spans: _Spans, span: Tensor, step: Tensor) -> Tensor:
     """Return the length of each fragment's ray per unit of view depth; `camera.rays` gives the same."""
     size = camera.pixel_size
-    y = (spans.row + (0.5 - camera.height / 2)) * size
-    x = (spans.column + (0.5 - camera.width / 2)) * size
+    y = (spans.row + (0.5 + camera.shift[1] - camera.height / 2)) * size
+    x = (spans.column + (0.5 + camera.shift[0] - camera.width / 2)) * size
     across = x.index_select(0, span) + size * step
     return torch.sqrt((1 + y.square()).index_select(0, span) + across.square())

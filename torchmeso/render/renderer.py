@@ -20,10 +20,11 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from torchmeso.backends import opencl
+from torchmeso.data import image
 from torchmeso.errors import BackendError, check_memory
 from torchmeso.geometry.camera import Camera
 from torchmeso.geometry.light import DirectionalLight, Light, SpotLight
-from torchmeso.render import device, shadow_map
+from torchmeso.render import device, film, shadow_map
 from torchmeso.render.device_raster import ROOM, STAMPS, DeviceViews
 from torchmeso.render.film import Picture
 from torchmeso.render.frame import MEMORY_LIMIT, FrameOptions
@@ -38,7 +39,7 @@ DETAILS, DISPLAY = 1, 2
 FRAME = np.dtype(
     [(name, "i4") for name in ("lights", "ambient_paper", "depths", "outputs")]
     + [(name, "i4") for name in ("capacity", "skips", "stride", "pitch")]
-    + [("ambient", "f4"), ("background", "f4", 3), ("rank_error", "f4"), ("pad", "i4", 3)]
+    + [("ambient", "f4"), ("background", "f4", 3), ("rank_error", "f4"), ("pixel", "f4"), ("pad", "i4", 2)]
 )
 
 
@@ -113,6 +114,11 @@ class Renderer:
             SizeError: the picture would need more memory than the limit.
             BackendError: too many lights.
         """
+        if self.options.antialias > 1:
+            return film.average(lambda c: self._render(c, lights), camera.jittered(self.options.antialias))
+        return self._render(camera, lights)
+
+    def _render(self, camera: Camera, lights: tuple[Light, ...] | None) -> Picture:
         start = time.perf_counter()
         picture = self._frame(camera, lights, DETAILS)
         seconds = {"frame": time.perf_counter() - start, **self._seconds}
@@ -124,6 +130,10 @@ class Renderer:
 
         Arguments, memory and errors as for `render`.
         """
+        if self.options.antialias > 1:
+            picture = self.render(camera, lights)
+            seen = 255 * (picture.owner != -1).to(torch.uint8)
+            return torch.cat([torch.from_numpy(image.to_bytes(picture.rgb)), seen[..., None]], -1)
         picture = self._frame(camera, lights, DISPLAY)
         return picture.shown[: camera.height, : camera.width]
 
@@ -143,7 +153,7 @@ class Renderer:
                 [camera], taken=self._taken, frustum=self._skips.frustum, cull=self._cull, rest=self._skips.resting
             )
             drawn = maps is not None and self._draw_maps(maps, lights)
-            self._draw_picture(picture, lights, outputs)
+            self._draw_picture(picture, camera, lights, outputs)
             counts = picture.views.counts()
             if self._fits(counts + (maps.views.counts() if drawn and maps else [])):
                 break
@@ -264,7 +274,7 @@ class Renderer:
             for number, empty in enumerate(maps.empty)
         ]  # fmt: skip
 
-    def _draw_picture(self, picture: "_Picture", lights: tuple[Light, ...], outputs: int) -> None:
+    def _draw_picture(self, picture: "_Picture", camera: Camera, lights: tuple[Light, ...], outputs: int) -> None:
         """Draw the picture of the camera it is aimed with."""
         scene, maps = self._on_device.scene, self._maps
         if picture.shone is not lights:
@@ -280,6 +290,7 @@ class Renderer:
         frame["depths"], frame["outputs"] = outputs == DETAILS or maps is not None, outputs
         frame["capacity"], frame["stride"] = self._taken + self._extra, picture.views.stride
         frame["skips"], frame["rank_error"] = self._skip_bits(), self.options.rank_error
+        frame["pixel"] = camera.pixel_size / self.options.antialias if self.options.filtering else 0.0
         frame["pitch"] = picture.rgba.shape[1]
         frame["ambient"], frame["background"] = scene.ambient, scene.background
         picture.frame.send()

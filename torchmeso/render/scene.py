@@ -153,6 +153,7 @@ class Points(NamedTuple):
         frame: world tangent frame; each vector (n, 3).
         scale: (n,) texture scale.
         owner: (n,) object.
+        pixel: (n,) world width of a pixel there.
     """
 
     position: Float[Tensor, "n 3"]
@@ -160,11 +161,13 @@ class Points(NamedTuple):
     frame: Frame
     scale: Float[Tensor, "n"]
     owner: Int[Tensor, "n"]
+    pixel: Float[Tensor, "n"]
 
     def select(self, which: Tensor) -> "Points":
         """Return the points `which` (numbers or a mask)."""
         frame = Frame(*(x[which] for x in self.frame))
-        return Points(self.position[which], self.uv[which], frame, self.scale[which], self.owner[which])
+        rest = (x[which] for x in (self.scale, self.owner, self.pixel))
+        return Points(self.position[which], self.uv[which], frame, *rest)
 
 
 def assemble(scene: Scene) -> World:
@@ -200,7 +203,8 @@ def interpolate(world: World, layers: Layers, camera: Camera, which: Int[Tensor,
     origin, direction, _ = rays(camera, layers.pixel[which], layers.t.dtype)
     position = origin + layers.t[which, None] * direction
     frame = frames.orthonormal(mean(world.normals), mean(world.tangents), world.sign[corner[:, 0]])
-    return Points(position, mean(world.uv), frame, mean(world.scale[:, None])[:, 0], world.owner[face])
+    scale = mean(world.scale[:, None])[:, 0]
+    return Points(position, mean(world.uv), frame, scale, world.owner[face], camera.pixel_width(position))
 
 
 def rays(
