@@ -14,7 +14,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from torchmeso import config, quality
-from torchmeso.bench import colour, peers, scenes, speed
+from torchmeso.bench import colour, limits, minify, peers, scenes, speed
 from torchmeso.bench.peers import PeerMissing
 from torchmeso.bench.suite import Context, Measurement, Row
 from torchmeso.bench.timing import Timing, time_together
@@ -336,6 +336,8 @@ MEASUREMENTS = [
     Measurement("mdf", mdf),
     Measurement("frame", speed.frame),
     Measurement("growth", speed.growth),
+    Measurement("minify", minify.minify),
+    Measurement("limits", limits.limits),
     Measurement("compiled", speed.compiled),
 ]
 """In the order they run."""

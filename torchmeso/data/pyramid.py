@@ -3,7 +3,7 @@
 Eigen maps are linear in what they show, so the mean of a texture's codes is the code of the mean: a level of the
 pyramid is exact, whatever light and view it is used with. What a pixel covers is a slanted box: as wide as the pixel
 across the view, longer by 1 / cos(theta_o) along it. Up to `MOST_PROBES` places along the box are read, each at the
-level whose texels are as large as its share of the box, so that grazing views stay sharp across. Levels blend into
+level whose texels have the area of its share of the box, so that grazing views stay sharp across. Levels blend into
 each other around the middle between two (`BLEND`), so that nothing jumps and most look-ups read one level.
 
 Distances are not filtered. A silhouette is a decision, and a mean of depths decides wrongly; jittered frames filter
@@ -20,8 +20,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 MOST_PROBES = 4
-SHARPNESS = -0.7
-"""Added to the level: a pixel's box is sharper than the tent that two levels and bilinear taps make of it."""
+SLANT = 2.0
+"""Lengths over widths that one place stands for."""
 
 BLEND = 0.15
 """Levels blend within this distance of the middle between two."""
@@ -77,9 +77,9 @@ def probes(uv: Float[Tensor, "n 2"], seen: Footprint, texels: int, levels: int) 
     """
     length = seen.along.norm(dim=-1)
     count = torch.minimum(length / seen.across.clamp(min=1e-30), length * texels)
-    count = (count - 1e-3).ceil().clamp(1, MOST_PROBES)
-    side = torch.maximum(seen.across, length / count)
-    level = (torch.log2((side * texels).clamp(min=1e-30)) + SHARPNESS).clamp(0, levels - 1)
+    count = (count / SLANT + 0.5).floor().clamp(1, MOST_PROBES)
+    share = seen.across * length / count * texels**2
+    level = (0.5 * torch.log2(share.clamp(min=1e-30))).clamp(0, levels - 1)
     lower = level.floor()
     upper_share = ((level - lower - 0.5) / (2 * BLEND) + 0.5).clamp(0, 1)
     found = []
