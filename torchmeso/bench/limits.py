@@ -1,4 +1,4 @@
-"""Rows of the suite `render` on what a BTF cannot know: light from one object to another, and shadows within the relief.
+"""Rows of the suite `render` on what a BTF cannot know: light between objects, and what shadows do within a relief.
 
 wang2005mdf, Limitations: a BTF is measured under even light, so where a macroscopic blocker's shadow ends, light that
 the mesostructure would pass on from the lit side is missing, and shadows come out too sharp. Nor does light go from
