@@ -25,9 +25,11 @@ static INNER void set_up_part(const int part, const int number, __global const V
         const int s = view->slots + 16 * v;
         const int lanes = (1 << MIN(16, count - 16 * v)) - 1;
         int hidden = 0, beside = 0;
+        Ints tag_of;
         for (int rest = lanes; rest; rest &= rest - 1) {
             const int lane = __builtin_ctz(rest);
             const int2 tag = tags[16 * v + lane];
+            tag_of.lane[lane] = tag.x;
             if (tag.y != object) {
                 object = tag.y;
                 place = overlap(view, objects + object);
@@ -69,7 +71,7 @@ static INNER void set_up_part(const int part, const int number, __global const V
         const int crosses = asked & ahead & ~whole;
         Planes planes;
         const int made = set_up_triangles(view, &corners, whole, hidden, triangles + s, &planes);
-        keep_planes(triangles + s, slots + s, made, &planes);
+        keep_planes(triangles + s, slots + s, made, &planes, &tag_of);
         const int16 face = (int16)(16 * v) + TO_INT(RAMP);
         *(__global int16 *)(labels + s) = face << 1 | (from_bits(planes.front) & FRONT);
         *(__global uchar16 *)(crossing + number * padded + 16 * v) =
@@ -213,7 +215,8 @@ __kernel void cut_faces(__global const View *restrict views, __global const doub
                     for (int j = 0; j < 3; j++) rows[r][j].lane[l] = share[j];
                 }
             }
-            keep_planes(triangles + s, slots + s, drawn, &planes);
+            const Ints tag = {(int16)tags[f].x};
+            keep_planes(triangles + s, slots + s, drawn, &planes, &tag);
             counted->drawn += __builtin_popcount(drawn);
             for (int l = 0; l < fits; l++) {
                 labels[s + l] = f << 1 | (planes.front >> l & FRONT);

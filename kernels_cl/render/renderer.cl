@@ -4,7 +4,6 @@
 // Compiled with SILHOUETTE (see silhouette.clh) and ONE_LAYER.
 
 #include "data/eigen_btf.clh"
-#include "render/silhouette.clh"
 #include "render/shadow_map.clh"
 
 // What a frame asks for.
@@ -185,7 +184,7 @@ static void draw_stamp(const Place *place, const Target *target, const Rays *ray
                         ? facing(lights + i, &seen->at.n, &seen->position, shaded) : shaded;
         tally->averted += __builtin_popcount(shaded & ~asked);
         const int first = lights[i].first_face, count = lights[i].faces;
-        blocked[i] = asked ? blocked_from(&target->shadows, first, count, &receiver, asked) : 0;
+        blocked[i] = asked ? blocked_from(place, &target->shadows, first, count, &receiver, asked) : 0;
         if (!(frame->outputs & OWNER)) continue;
         for (int l = 0; l < 16; l++)
             target->shadowed[i * plane + (rays->y + (l >> 2)) * frame->pitch + rays->x + (l & 3)] = blocked[i] >> l & 1;
@@ -358,7 +357,9 @@ static INNER void draw_tiles(const int worker, __global const View *restrict vie
                              __global const uchar *restrict tables, __global const Mdf *restrict mdfs,
                              __global const Reflectance *restrict reflectances, __global const Light *restrict lights,
                              __global const View *restrict light_views, __global const Slot *restrict light_slots,
-                             __global const Texel *restrict texels,
+                             __global const int *restrict light_labels, __global Counters *restrict light_counters,
+                             __global Passage *restrict passages, __global float16 *restrict kept_key,
+                             __global int16 *restrict kept_slot, __global Blockers *restrict blockers,
                              __global const Frame *restrict frame, __global float16 *restrict key,
                              __global int16 *restrict slot, __global uchar4 *restrict shown,
                              __global float4 *restrict rgba, __global float *restrict depth,
@@ -367,7 +368,8 @@ static INNER void draw_tiles(const int worker, __global const View *restrict vie
 {
     const Place place = {view, slots, labels, records, facets, tables, mdfs, counters->near_bodies, 1,
                          frame->skips};
-    const Shadows shadows = {light_views, light_slots, texels};
+    const Shadows shadows = {light_views, light_slots, light_labels, light_counters,
+                             passages, kept_key, kept_slot, blockers};
     const Target target = {frame, reflectances, lights, shadows, shown, rgba, depth, owner, shadowed};
     const int across = (view->width + TILE - 1) / TILE, down = (view->height + TILE - 1) / TILE;
     Lists lists;
@@ -428,7 +430,9 @@ void draw(__global const View *restrict view, __global const Triangle *restrict 
           __global const uchar *restrict tables, __global const Mdf *restrict mdfs,
           __global const Reflectance *restrict reflectances, __global const Light *restrict lights,
           __global const View *restrict light_views, __global const Slot *restrict light_slots,
-          __global const Texel *restrict texels,
+          __global const int *restrict light_labels, __global Counters *restrict light_counters,
+          __global Passage *restrict passages, __global float16 *restrict kept_key, __global int16 *restrict kept_slot,
+          __global Blockers *restrict blockers,  // of lights; as `draw_light` has them
           __global const Frame *restrict frame,
           __global float16 *restrict key, __global int16 *restrict slot,  // layers of the tiles at work
           __global uchar4 *restrict shown,     // (H, pitch) sRGB, and 255 where an object is seen
@@ -439,6 +443,6 @@ void draw(__global const View *restrict view, __global const Triangle *restrict 
           __global uchar *restrict empty)      // (stamps) whether a stamp already shows the background
 {
     draw_tiles(get_group_id(0), view, triangles, slots, labels, boxes, coarse, counters, records, facets, tables,
-               mdfs, reflectances, lights, light_views, light_slots, texels, frame, key,
-               slot, shown, rgba, depth, owner, shadowed, empty);
+               mdfs, reflectances, lights, light_views, light_slots, light_labels, light_counters, passages, kept_key,
+               kept_slot, blockers, frame, key, slot, shown, rgba, depth, owner, shadowed, empty);
 }

@@ -290,6 +290,7 @@ SKIPS = {
     "facing": ("shadow tests of what leans away", "curved"),
     "resting": ("shadow maps kept", "curved"),
     "unlit": ("lights left out", "curved"),
+    "unseen": ("shadow stamps left out", "curved"),
 }
 """Each skip, what counts it, and a silhouette that it works with."""
 

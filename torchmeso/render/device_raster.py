@@ -27,7 +27,7 @@ TRIANGLE_BYTES, SLOT_BYTES, LIMIT = 96, 64, 1 << 30
 
 VIEW = np.dtype(
     [("eye", "f8", 3), ("axes", "f8", (3, 3)), ("pixel_size", "f8"), ("near", "f8")]
-    + [(name, "i4") for name in ("width", "height", "perspective", "slots", "texels", "frustum", "cull", "pad")]
+    + [(name, "i4") for name in ("width", "height", "perspective", "slots", "stamps", "frustum", "cull", "pad")]
 )
 """A camera as the kernels read it."""
 
@@ -37,7 +37,8 @@ BOX = np.dtype([("centre", "f8", 3), ("reach", "f8", 3), ("body", "i4"), ("pad",
 COUNTERS = (
     "used", "vectors", "slots", "tile", "crossing", "behind", "degenerate", "drawn", "fragments",
     "deepest", "covered", "intervals", "deep", "carved", "inside", "hidden", "looked", "spared", "empty",
-    "beside", "turned", "losers", "bounded", "near_bodies", "averted",
+    "beside", "turned", "losers", "bounded", "near_bodies", "averted", "kept",
+    "stamps", "asked",
 )  # fmt: skip
 """What the kernels count, in the order of `Counters` in kernels_cl/render/rasterize.clh; padded to 32."""
 
@@ -194,15 +195,15 @@ class DeviceViews:
         Returns:
             whether they stayed.
         """
-        texels, self.may_cut = 0, False
+        stamps, self.may_cut = 0, False
         for r, camera in zip(self._views.array, cameras, strict=True):
             r["eye"], r["axes"] = camera.eye.double().numpy(), camera.axes.double().numpy()
             r["pixel_size"], r["near"] = camera.pixel_size, camera.near
             r["width"], r["height"] = camera.width, camera.height
             r["perspective"] = camera.projection == "perspective"
-            r["texels"], r["frustum"], r["cull"] = texels, frustum, cull
+            r["stamps"], r["frustum"], r["cull"] = stamps, frustum, cull
             self.may_cut |= not _uncut(camera, self.mesh)
-            texels += camera.width * camera.height
+            stamps += -(-camera.width // 4) * -(-camera.height // 4)
         aimed = self._views.array.tobytes()
         stays, self._aimed = rest and aimed == self._aimed, aimed
         counters = self._counters.array
