@@ -264,7 +264,7 @@ static Seen look(const Place *place, const Rays *rays, __global const float16 *k
         int fronts = 0;
         for (int rest = asked & found.single; rest; rest &= rest - 1) {
             const int l = __builtin_ctz(rest);
-            if (place->labels[found.front.lane[l]] & FRONT) fronts |= 1 << l;
+            if (tag_of(place, found.front.lane[l]) & FRONT) fronts |= 1 << l;
         }
         asked = (asked & ~found.single) | fronts;
         d = reach.vector >= 0.0f ? reach.vector : 0.0f;
@@ -350,14 +350,14 @@ static void clear_stamp(__global const Frame *frame, const int plane, const int 
 
 static INNER void draw_tiles(const int worker, __global const View *restrict view,
                              __global const Triangle *restrict triangles, __global const Slot *restrict slots,
-                             __global const int *restrict labels,
+                             __global const Label *restrict labels,
                              __global const int16 *restrict boxes, __global const int16 *restrict coarse,
                              __global Counters *restrict counters,
                              __global const float16 *restrict records, __global const Facet *restrict facets,
                              __global const uchar *restrict tables, __global const Mdf *restrict mdfs,
                              __global const Reflectance *restrict reflectances, __global const Light *restrict lights,
                              __global const View *restrict light_views, __global const Slot *restrict light_slots,
-                             __global const int *restrict light_labels, __global Counters *restrict light_counters,
+                             __global const Label *restrict light_labels, __global Counters *restrict light_counters,
                              __global Passage *restrict passages, __global float16 *restrict kept_key,
                              __global int16 *restrict kept_slot, __global Blockers *restrict blockers,
                              __global const Frame *restrict frame, __global float16 *restrict key,
@@ -423,14 +423,14 @@ static INNER void draw_tiles(const int worker, __global const View *restrict vie
 
 __kernel __attribute__((reqd_work_group_size(1, 1, 1)))
 void draw(__global const View *restrict view, __global const Triangle *restrict triangles,
-          __global const Slot *restrict slots, __global const int *restrict labels,
+          __global const Slot *restrict slots, __global const Label *restrict labels,
           __global const int16 *restrict boxes, __global const int16 *restrict coarse,
           __global Counters *restrict counters,
           __global const float16 *restrict records, __global const Facet *restrict facets,
           __global const uchar *restrict tables, __global const Mdf *restrict mdfs,
           __global const Reflectance *restrict reflectances, __global const Light *restrict lights,
           __global const View *restrict light_views, __global const Slot *restrict light_slots,
-          __global const int *restrict light_labels, __global Counters *restrict light_counters,
+          __global const Label *restrict light_labels, __global Counters *restrict light_counters,
           __global Passage *restrict passages, __global float16 *restrict kept_key, __global int16 *restrict kept_slot,
           __global Blockers *restrict blockers,  // of lights; as `draw_light` has them
           __global const Frame *restrict frame,

@@ -49,7 +49,7 @@ static INNER void draw_light_tiles(const int worker, const int number, const Pla
 
 __kernel __attribute__((reqd_work_group_size(1, 1, 1)))
 void draw_light(__global const View *restrict views, __global const Triangle *restrict triangles,
-                __global const Slot *restrict slots, __global const int *restrict labels,
+                __global const Slot *restrict slots, __global const Label *restrict labels,
                 __global const int16 *restrict boxes, __global const int16 *restrict coarse,
                 __global Counters *restrict counters,
                 __global const float16 *restrict records, __global const Facet *restrict facets,

@@ -22,7 +22,7 @@ TILE, STAMPS, ROOM, VECTORS = 64, 256, 4, 8
 """Side of a tile in pixels, its stamps, layers a stamp begins with, and sixteens of faces that a work-item sets up; in
 kernels_cl/render/rasterize.clh."""
 
-TRIANGLE_BYTES, SLOT_BYTES, LIMIT = 96, 64, 1 << 30
+TRIANGLE_BYTES, SLOT_BYTES, LABEL_BYTES, LIMIT = 96, 64, 8, 1 << 30
 """Sizes of the kernels' structures, and what no box reaches."""
 
 VIEW = np.dtype(
@@ -155,7 +155,7 @@ class DeviceViews:
         self.views, self.counters = self._views.buffer, self._counters.buffer
         self.triangles = opencl.allocate(count * self.stride * TRIANGLE_BYTES)
         self.slots = opencl.allocate(count * self.stride * SLOT_BYTES)
-        self.labels = opencl.allocate(count * self.stride * 4)
+        self.labels = opencl.allocate(count * self.stride * LABEL_BYTES)
         self.boxes = opencl.upload(np.full(count * self.stride * 4, LIMIT, np.int32))
         self.coarse = opencl.upload(np.full(count * vectors * 4, LIMIT, np.int32))
         crossing = opencl.allocate(count * self.padded)
@@ -275,7 +275,7 @@ class DeviceRaster:
         begin, layers = (opencl.fetch(x, np.zeros(across * down, np.int32)) for x in (self._begin, self._layers))
         key = opencl.fetch(self._key, np.zeros((self._capacity, 16), np.float32))
         slot = opencl.fetch(self._slot, np.zeros((self._capacity, 16), np.int32))
-        faces = opencl.fetch(self.views.labels, np.zeros(self.views.stride, np.int32)) >> 1
+        faces = opencl.fetch(self.views.labels, np.zeros((self.views.stride, 2), np.int32))[:, 0]
         stamp = np.repeat(np.arange(across * down), layers)
         layer = np.arange(len(stamp)) - np.repeat(np.cumsum(layers) - layers, layers)
         key, slot = key[begin[stamp] + layer], slot[begin[stamp] + layer]
