@@ -199,7 +199,7 @@ class Renderer:
         kept = max(c["kept"] for c in counts)
         if used <= self._taken + self._extra and slots <= room and (self._maps is None or kept <= self._maps.room):
             return True
-        self._kept_room = max(self._kept_room, kept)
+        self._kept_room = max(self._kept_room, kept + kept // 4)
         self._extra = max(self._extra, 2 * (used - self._taken))
         self._cut_room = max(self._cut_room, slots)
         self._lists = self._picture = self._maps = None
