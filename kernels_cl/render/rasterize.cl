@@ -8,7 +8,7 @@
 static INNER void set_up_part(const int part, const int number, __global const View *restrict views,
                               __global const double *restrict vertices, __global const int *restrict faces,
                               __global const int2 *restrict tags, __global Triangle *restrict triangles,
-                              __global Slot *restrict slots, __global int *restrict labels,
+                              __global Slot *restrict slots, __global Label *restrict labels,
                               __global int *restrict boxes, __global int *restrict coarse,
                               __global uchar *restrict crossing, __global Counters *restrict counters,
                               __global const Box *restrict objects, const int count, const int padded,
@@ -28,6 +28,8 @@ static INNER void set_up_part(const int part, const int number, __global const V
         for (int rest = lanes; rest; rest &= rest - 1) {
             const int lane = __builtin_ctz(rest);
             const int2 tag = tags[16 * v + lane];
+            labels[s + lane].face = 16 * v + lane;
+            labels[s + lane].tag = tag.x;
             if (tag.y != object) {
                 object = tag.y;
                 place = overlap(view, objects + object);
@@ -70,8 +72,7 @@ static INNER void set_up_part(const int part, const int number, __global const V
         Planes planes;
         const int made = set_up_triangles(view, &corners, whole, hidden, triangles + s, &planes);
         keep_planes(triangles + s, slots + s, made, &planes);
-        const int16 face = (int16)(16 * v) + TO_INT(RAMP);
-        *(__global int16 *)(labels + s) = face << 1 | (from_bits(planes.front) & FRONT);
+        for (int rest = made & planes.front; rest; rest &= rest - 1) labels[s + __builtin_ctz(rest)].tag |= FRONT;
         *(__global uchar16 *)(crossing + number * padded + 16 * v) =
             __builtin_convertvector(from_bits(crosses), uchar16);
         for (int k = 0; k < 4; k++) {
@@ -100,7 +101,7 @@ __kernel void set_up(__global const View *restrict views, __global const double 
                      __global const int *restrict faces,   // (F, 3)
                      __global const int2 *restrict tags,   // (F) component << 2 | CLOSED, object
                      __global Triangle *restrict triangles, __global Slot *restrict slots,
-                     __global int *restrict labels,
+                     __global Label *restrict labels,
                      __global int *restrict boxes,         // (4, slots) per view: low x, low y, -high x, -high y
                      __global int *restrict coarse,        // (4, slots / 16)
                      __global uchar *restrict crossing,    // (padded faces) per view
@@ -153,7 +154,7 @@ static int cut(Corner *corner, const int count, const int plane, const double ne
 __kernel void cut_faces(__global const View *restrict views, __global const double *restrict vertices,
                         __global const int *restrict faces, __global const int2 *restrict tags,
                         __global Triangle *restrict triangles, __global Slot *restrict slots,
-                        __global int *restrict labels, __global int *restrict boxes, __global int *restrict coarse,
+                        __global Label *restrict labels, __global int *restrict boxes, __global int *restrict coarse,
                         __global const uchar *restrict crossing, __global Counters *restrict counters,
                         const int count, const int padded, const int stride)
 {
@@ -216,7 +217,8 @@ __kernel void cut_faces(__global const View *restrict views, __global const doub
             keep_planes(triangles + s, slots + s, drawn, &planes);
             counted->drawn += __builtin_popcount(drawn);
             for (int l = 0; l < fits; l++) {
-                labels[s + l] = f << 1 | (planes.front >> l & FRONT);
+                labels[s + l].face = f;
+                labels[s + l].tag = tags[f].x | (planes.front >> l & FRONT);
                 for (int b = 0; b < 4; b++) box_of[b * stride + padded + n - pieces + l] = planes.box[b].lane[l];
             }
         }

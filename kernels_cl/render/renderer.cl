@@ -4,7 +4,6 @@
 // Compiled with SILHOUETTE (see silhouette.clh) and ONE_LAYER.
 
 #include "data/eigen_btf.clh"
-#include "render/silhouette.clh"
 #include "render/shadow_map.clh"
 
 // What a frame asks for.
@@ -187,7 +186,7 @@ static void draw_stamp(const Place *place, const Target *target, const Rays *ray
                         ? facing(lights + i, &seen->at.n, &seen->position, shaded) : shaded;
         tally->averted += __builtin_popcount(shaded & ~asked);
         const int first = lights[i].first_face, count = lights[i].faces;
-        blocked[i] = asked ? blocked_from(&target->shadows, first, count, &receiver, asked) : 0;
+        blocked[i] = asked ? blocked_from(place, &target->shadows, first, count, &receiver, asked) : 0;
         if (!(frame->outputs & OWNER)) continue;
         for (int l = 0; l < 16; l++)
             target->shadowed[i * plane + (rays->y + (l >> 2)) * frame->pitch + rays->x + (l & 3)] = blocked[i] >> l & 1;
@@ -267,7 +266,7 @@ static Seen look(const Place *place, const Rays *rays, __global const float16 *k
         int fronts = 0;
         for (int rest = asked & found.single; rest; rest &= rest - 1) {
             const int l = __builtin_ctz(rest);
-            if (place->labels[found.front.lane[l]] & FRONT) fronts |= 1 << l;
+            if (tag_of(place, found.front.lane[l]) & FRONT) fronts |= 1 << l;
         }
         asked = (asked & ~found.single) | fronts;
         d = reach.vector >= 0.0f ? reach.vector : 0.0f;
@@ -353,14 +352,16 @@ static void clear_stamp(__global const Frame *frame, const int plane, const int 
 
 static INNER void draw_tiles(const int worker, __global const View *restrict view,
                              __global const Triangle *restrict triangles, __global const Slot *restrict slots,
-                             __global const int *restrict labels,
+                             __global const Label *restrict labels,
                              __global const int16 *restrict boxes, __global const int16 *restrict coarse,
                              __global Counters *restrict counters,
                              __global const float16 *restrict records, __global const Facet *restrict facets,
                              __global const uchar *restrict tables, __global const Mdf *restrict mdfs,
                              __global const Reflectance *restrict reflectances, __global const Light *restrict lights,
                              __global const View *restrict light_views, __global const Slot *restrict light_slots,
-                             __global const Texel *restrict texels,
+                             __global const Label *restrict light_labels, __global Counters *restrict light_counters,
+                             __global Passage *restrict passages, __global float16 *restrict kept_key,
+                             __global int16 *restrict kept_slot, __global Blockers *restrict blockers,
                              __global const Frame *restrict frame, __global float16 *restrict key,
                              __global int16 *restrict slot, __global uchar4 *restrict shown,
                              __global float4 *restrict rgba, __global float *restrict depth,
@@ -369,7 +370,8 @@ static INNER void draw_tiles(const int worker, __global const View *restrict vie
 {
     const Place place = {view, slots, labels, records, facets, tables, mdfs, counters->near_bodies, 1,
                          frame->skips};
-    const Shadows shadows = {light_views, light_slots, texels};
+    const Shadows shadows = {light_views, light_slots, light_labels, light_counters,
+                             passages, kept_key, kept_slot, blockers};
     const Target target = {frame, reflectances, lights, shadows, shown, rgba, depth, owner, shadowed};
     const int across = (view->width + TILE - 1) / TILE, down = (view->height + TILE - 1) / TILE;
     Lists lists;
@@ -423,14 +425,16 @@ static INNER void draw_tiles(const int worker, __global const View *restrict vie
 
 __kernel __attribute__((reqd_work_group_size(1, 1, 1)))
 void draw(__global const View *restrict view, __global const Triangle *restrict triangles,
-          __global const Slot *restrict slots, __global const int *restrict labels,
+          __global const Slot *restrict slots, __global const Label *restrict labels,
           __global const int16 *restrict boxes, __global const int16 *restrict coarse,
           __global Counters *restrict counters,
           __global const float16 *restrict records, __global const Facet *restrict facets,
           __global const uchar *restrict tables, __global const Mdf *restrict mdfs,
           __global const Reflectance *restrict reflectances, __global const Light *restrict lights,
           __global const View *restrict light_views, __global const Slot *restrict light_slots,
-          __global const Texel *restrict texels,
+          __global const Label *restrict light_labels, __global Counters *restrict light_counters,
+          __global Passage *restrict passages, __global float16 *restrict kept_key, __global int16 *restrict kept_slot,
+          __global Blockers *restrict blockers,  // of lights; as `draw_light` has them
           __global const Frame *restrict frame,
           __global float16 *restrict key, __global int16 *restrict slot,  // layers of the tiles at work
           __global uchar4 *restrict shown,     // (H, pitch) sRGB, and 255 where an object is seen
@@ -441,6 +445,6 @@ void draw(__global const View *restrict view, __global const Triangle *restrict 
           __global uchar *restrict empty)      // (stamps) whether a stamp already shows the background
 {
     draw_tiles(get_group_id(0), view, triangles, slots, labels, boxes, coarse, counters, records, facets, tables,
-               mdfs, reflectances, lights, light_views, light_slots, texels, frame, key,
-               slot, shown, rgba, depth, owner, shadowed, empty);
+               mdfs, reflectances, lights, light_views, light_slots, light_labels, light_counters, passages, kept_key,
+               kept_slot, blockers, frame, key, slot, shown, rgba, depth, owner, shadowed, empty);
 }

@@ -93,8 +93,7 @@ def test_a_file_is_composed_of_what_it_includes_once():
 
 
 def test_kernels_build_where_the_compiler_knows_no_attributes(device, monkeypatch):
-    monkeypatch.setattr(opencl, "WIDE", ("no such thing;\n", "\n"))
-    monkeypatch.setattr(opencl, "_has_avx512", lambda: True)
+    monkeypatch.setattr(opencl, "_instructions", lambda: ("no such thing",))
     assert opencl._program.__wrapped__("backends/opencl.cl", ()) is not None
 
 

@@ -34,16 +34,8 @@ os.environ.setdefault("POCL_AFFINITY", "1")
 
 KERNELS = files("kernels_cl")
 
-WIDE = (
-    "#pragma clang attribute push(__attribute__((min_vector_width(512))), apply_to = function)\n"
-    "#define HAS_AVX512\n"
-    '#pragma clang attribute push(__attribute__((target("avx512f,avx512bw,avx512cd,avx512dq,avx512vl"))), '
-    "apply_to = function)\n",
-    "#pragma clang attribute pop\n#pragma clang attribute pop\n",
-)
-"""What is put around a kernel's source where the processor has AVX-512. PoCL builds for what its compiler knows of the
-processor, which for one younger than the compiler is AVX2; vectors of sixteen are then split in two. HAS_AVX512 tells
-kernels_cl/common/vector.clh of the instructions it may use."""
+AVX512, DOT_PRODUCTS = ("avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"), ("avx512vbmi", "avx512vnni")
+"""What a processor needs for vectors of sixteen, and for sums of products of bytes, in the compiler's words."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -177,7 +169,7 @@ def _program(path: str, options: tuple[str, ...]) -> "cl.Program":
     source = compose(path)
     failure: Exception | None = None
     # A compiler that does not know the attributes builds for what it knows.
-    for text in (WIDE[0] + source + WIDE[1], source) if _has_avx512() else (source,):
+    for text in (_widened(source), source) if _instructions() else (source,):
         program = cl.Program(queue().context, text)
         try:
             with warnings.catch_warnings():
@@ -188,15 +180,32 @@ def _program(path: str, options: tuple[str, ...]) -> "cl.Program":
     raise BackendError(f"kernels_cl/{path} did not build:\n{failure}") from failure
 
 
+def _widened(source: str) -> str:
+    """Return a kernel's source, built for the instructions that the processor has.
+
+    PoCL builds for what its compiler knows of the processor, which for one younger than the compiler is AVX2; vectors
+    of sixteen are then split in two. HAS_AVX512 and HAS_DOT_PRODUCTS tell kernels of the instructions they may use.
+    """
+    wanted = _instructions()
+    return (
+        "#pragma clang attribute push(__attribute__((min_vector_width(512))), apply_to = function)\n"
+        f'#pragma clang attribute push(__attribute__((target("{",".join(wanted)}"))), apply_to = function)\n'
+        f"#define HAS_AVX512\n{'#define HAS_DOT_PRODUCTS' * (set(DOT_PRODUCTS) <= set(wanted))}\n"
+        f"{source}\n#pragma clang attribute pop\n#pragma clang attribute pop\n"
+    )
+
+
 @cache
-def _has_avx512() -> bool:
-    """Return whether the chosen device is this processor and it has AVX-512."""
+def _instructions() -> tuple[str, ...]:
+    """Return `AVX512`, and `DOT_PRODUCTS`, where the chosen device is this processor and it has them."""
     try:
-        flags = re.search(r"^flags\s*:(.*)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
+        found = re.search(r"^flags\s*:(.*)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
     except OSError:
-        return False
-    wanted = {f"avx512{x}" for x in ("f", "bw", "cd", "dq", "vl")}
-    return _shares_memory() and flags is not None and wanted <= set(flags[1].split())
+        return ()
+    flags = {flag.replace("_", "") for flag in found[1].split()} if found else set()  # avx512_vnni
+    if not _shares_memory() or not flags.issuperset(AVX512):
+        return ()
+    return AVX512 + DOT_PRODUCTS * flags.issuperset(DOT_PRODUCTS)
 
 
 def upload(x: np.ndarray) -> "cl.Buffer":

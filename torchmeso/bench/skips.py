@@ -31,6 +31,7 @@ COUNTERS = {
     "facing": "shadow tests of what leans away",
     "resting": "shadow maps kept",
     "unlit": "lights left out",
+    "unseen": "shadow stamps left out",
 }
 """What counts each skip."""
 

@@ -22,12 +22,12 @@ TILE, STAMPS, ROOM, VECTORS = 64, 256, 4, 8
 """Side of a tile in pixels, its stamps, layers a stamp begins with, and sixteens of faces that a work-item sets up; in
 kernels_cl/render/rasterize.clh."""
 
-TRIANGLE_BYTES, SLOT_BYTES, LIMIT = 96, 64, 1 << 30
+TRIANGLE_BYTES, SLOT_BYTES, LABEL_BYTES, LIMIT = 96, 64, 8, 1 << 30
 """Sizes of the kernels' structures, and what no box reaches."""
 
 VIEW = np.dtype(
     [("eye", "f8", 3), ("axes", "f8", (3, 3)), ("pixel_size", "f8"), ("near", "f8"), ("shift", "f8", 2)]
-    + [(name, "i4") for name in ("width", "height", "perspective", "slots", "texels", "frustum", "cull", "pad")]
+    + [(name, "i4") for name in ("width", "height", "perspective", "slots", "stamps", "frustum", "cull", "pad")]
 )
 """A camera as the kernels read it."""
 
@@ -37,7 +37,8 @@ BOX = np.dtype([("centre", "f8", 3), ("reach", "f8", 3), ("body", "i4"), ("pad",
 COUNTERS = (
     "used", "vectors", "slots", "tile", "crossing", "behind", "degenerate", "drawn", "fragments",
     "deepest", "covered", "intervals", "deep", "carved", "inside", "hidden", "looked", "spared", "empty",
-    "beside", "turned", "losers", "bounded", "near_bodies", "averted",
+    "beside", "turned", "losers", "bounded", "near_bodies", "averted", "kept",
+    "stamps", "asked",
 )  # fmt: skip
 """What the kernels count, in the order of `Counters` in kernels_cl/render/rasterize.clh; padded to 32."""
 
@@ -154,7 +155,7 @@ class DeviceViews:
         self.views, self.counters = self._views.buffer, self._counters.buffer
         self.triangles = opencl.allocate(count * self.stride * TRIANGLE_BYTES)
         self.slots = opencl.allocate(count * self.stride * SLOT_BYTES)
-        self.labels = opencl.allocate(count * self.stride * 4)
+        self.labels = opencl.allocate(count * self.stride * LABEL_BYTES)
         self.boxes = opencl.upload(np.full(count * self.stride * 4, LIMIT, np.int32))
         self.coarse = opencl.upload(np.full(count * vectors * 4, LIMIT, np.int32))
         crossing = opencl.allocate(count * self.padded)
@@ -194,15 +195,15 @@ class DeviceViews:
         Returns:
             whether they stayed.
         """
-        texels, self.may_cut = 0, False
+        stamps, self.may_cut = 0, False
         for r, camera in zip(self._views.array, cameras, strict=True):
             r["eye"], r["axes"] = camera.eye.double().numpy(), camera.axes.double().numpy()
             r["pixel_size"], r["near"], r["shift"] = camera.pixel_size, camera.near, camera.shift
             r["width"], r["height"] = camera.width, camera.height
             r["perspective"] = camera.projection == "perspective"
-            r["texels"], r["frustum"], r["cull"] = texels, frustum, cull
+            r["stamps"], r["frustum"], r["cull"] = stamps, frustum, cull
             self.may_cut |= not _uncut(camera, self.mesh)
-            texels += camera.width * camera.height
+            stamps += -(-camera.width // 4) * -(-camera.height // 4)
         aimed = self._views.array.tobytes()
         stays, self._aimed = rest and aimed == self._aimed, aimed
         counters = self._counters.array
@@ -274,7 +275,7 @@ class DeviceRaster:
         begin, layers = (opencl.fetch(x, np.zeros(across * down, np.int32)) for x in (self._begin, self._layers))
         key = opencl.fetch(self._key, np.zeros((self._capacity, 16), np.float32))
         slot = opencl.fetch(self._slot, np.zeros((self._capacity, 16), np.int32))
-        faces = opencl.fetch(self.views.labels, np.zeros(self.views.stride, np.int32)) >> 1
+        faces = opencl.fetch(self.views.labels, np.zeros((self.views.stride, 2), np.int32))[:, 0]
         stamp = np.repeat(np.arange(across * down), layers)
         layer = np.arange(len(stamp)) - np.repeat(np.cumsum(layers) - layers, layers)
         key, slot = key[begin[stamp] + layer], slot[begin[stamp] + layer]

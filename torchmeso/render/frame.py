@@ -40,6 +40,7 @@ class Skips:
         facing: points that lean away from all lights ask a screen for neither depth nor shadow.
         resting: shadow maps stay while light and objects do, and triangles on the screen while the camera does.
         unlit: lights that reach no object are left out.
+        unseen: what stops the light is found out only in stamps of a shadow map where it could shadow what is seen.
     """
 
     frustum: bool = True
@@ -52,6 +53,7 @@ class Skips:
     facing: bool = True
     resting: bool = True
     unlit: bool = True
+    unseen: bool = True
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

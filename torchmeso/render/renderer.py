@@ -56,7 +56,7 @@ class Renderer:
         self.options = options or FrameOptions()
         self._skips, self._one_layer = self.options.skips, one_layer
         self._workers = opencl.units()
-        self._extra, self._cut_room, self._light_room = 4096, 0, 1
+        self._extra, self._cut_room, self._light_room, self._kept_room = 4096, 0, 1, 0
         self._lists: tuple[opencl.Buffer, opencl.Buffer] | None = None
         self._picture: _Picture | None = None
         self._maps: _Maps | None = None
@@ -154,8 +154,8 @@ class Renderer:
             )
             drawn = maps is not None and self._draw_maps(maps, lights)
             self._draw_picture(picture, camera, lights, outputs)
-            counts = picture.views.counts()
-            if self._fits(counts + (maps.views.counts() if drawn and maps else [])):
+            counts, light_counts = picture.views.counts(), maps.views.counts() if maps else []
+            if self._fits(counts + light_counts):
                 break
         opencl.read(picture.results[:1] if outputs == DISPLAY else picture.results[1:])
         picture.lit = (len(given), reaching)
@@ -164,6 +164,7 @@ class Renderer:
             "lights left out": len(given) - len(reaching),
             "shadow maps drawn": faces if drawn else 0,
             "shadow maps kept": 0 if drawn else faces,
+            "shadow stamps left out": sum(c["stamps"] - c["asked"] for c in light_counts),
             "triangles kept": counts[0]["drawn"] if stays else 0,
             "frames without silhouette code": int(self._plain),
             **self._uploaded,
@@ -205,8 +206,10 @@ class Renderer:
         """Return whether all layers and cut triangles had room; make more where not."""
         used, slots = max(c["used"] for c in counts), max(c["slots"] for c in counts)
         room = self._picture.views.room_for_cuts() if self._picture else 0
-        if used <= self._taken + self._extra and slots <= room:
+        kept = max(c["kept"] for c in counts)
+        if used <= self._taken + self._extra and slots <= room and (self._maps is None or kept <= self._maps.room):
             return True
+        self._kept_room = max(self._kept_room, kept + kept // 4)
         self._extra = max(self._extra, 2 * (used - self._taken))
         self._cut_room = max(self._cut_room, slots)
         self._lists = self._picture = self._maps = None
@@ -251,11 +254,15 @@ class Renderer:
 
     def _make_maps(self, sizes: tuple[tuple[int, ...], ...]) -> "_Maps":
         sides = [side for of_light in sizes for side in of_light]
+        stamps = sum((-(-side // 4)) ** 2 for side in sides)
+        room = max(self._kept_room, 2 * stamps)
         # Empty from the start: where layers find no room a tile stays as it was, and the frame is drawn again.
-        texels = opencl.upload(np.full((sum(side * side for side in sides), 2), -1, np.int32))
-        empty = [opencl.upload(np.zeros((-(-side // 4)) ** 2, np.uint8)) for side in sides]
+        stored = (
+            opencl.upload(np.zeros((stamps, 2), np.int32)), opencl.allocate(64 * room), opencl.allocate(64 * room),
+            opencl.allocate(128 * stamps),
+        )  # fmt: skip
         faces = [len(of_light) for of_light in sizes]
-        maps = _Maps(views=self._views(len(sides)), texels=texels, empty=empty, sizes=sizes, faces=faces)
+        maps = _Maps(views=self._views(len(sides)), stored=stored, room=room, sizes=sizes, faces=faces)
         maps.draw = self._map_calls(maps)
         return maps
 
@@ -268,10 +275,11 @@ class Renderer:
                 "render/shadow_map.cl", "draw_light", (self._workers,), (1,),
                 (views.views, views.triangles, views.slots, views.labels, views.boxes, views.coarse, views.counters,
                  geometry.records, geometry.facets, materials.tables, materials.mdfs, np.int32(number),
-                 np.int32(views.stride), capacity, np.int32(self._skip_bits()), *self._layers(), maps.texels, empty),
+                 np.int32(views.stride), capacity, np.int32(maps.room), np.int32(self._skip_bits()), *self._layers(),
+                 *maps.stored),
                 self._defines,
             )
-            for number, empty in enumerate(maps.empty)
+            for number in range(views.count)
         ]  # fmt: skip
 
     def _draw_picture(self, picture: "_Picture", camera: Camera, lights: tuple[Light, ...], outputs: int) -> None:
@@ -303,7 +311,7 @@ class Renderer:
     def _skip_bits(self) -> int:
         """Return the skips as `SKIP_*` in kernels_cl/render/scene.clh."""
         s = self._skips
-        return s.empty | s.behind << 1 | s.bounds << 2 | s.losers << 3 | s.facing << 4
+        return s.empty | s.behind << 1 | s.bounds << 2 | s.losers << 3 | s.facing << 4 | s.unseen << 5
 
     def _make_picture(self, key: tuple) -> "_Picture":
         width, height, n_light, _ = key
@@ -326,12 +334,14 @@ class Renderer:
         """Return the call that draws a picture."""
         geometry, materials = self._on_device.geometry, self._on_device.materials
         maps, views = self._maps, picture.views
-        shadows = (maps.views.views, maps.views.slots, maps.texels) if maps else (views.views, views.slots, views.slots)
+        lights = maps.views if maps else views
+        stored = maps.stored if maps else (views.slots,) * 4  # not read
         return opencl.Call(
             "render/renderer.cl", "draw", (self._workers,), (1,),
             (views.views, views.triangles, views.slots, views.labels, views.boxes, views.coarse, views.counters,
              geometry.records, geometry.facets, materials.tables, materials.mdfs, materials.reflectances,
-             picture.lights.buffer, *shadows, picture.frame.buffer, *self._layers(),
+             picture.lights.buffer, lights.views, lights.slots, lights.labels, lights.counters, *stored,
+             picture.frame.buffer, *self._layers(),
              *(b for b, _ in picture.results), picture.empty.buffer),
             self._defines,
         )  # fmt: skip
@@ -370,8 +380,8 @@ class _Maps:
     """Shadow maps of all lights on the device."""
 
     views: DeviceViews
-    texels: "opencl.Buffer"
-    empty: "list[opencl.Buffer]"  # which stamps of a map show nothing
+    stored: "tuple[opencl.Buffer, ...]"  # passages, their keys and triangles, blockers: of all maps
+    room: int  # layers
     draw: list[opencl.Call] = field(init=False)
     sizes: tuple[tuple[int, ...], ...]  # sides of the faces of each light
     faces: list[int]
