@@ -18,7 +18,6 @@ import click
 from torchmeso.backends.allocator import keep_freed_memory
 from torchmeso.errors import ConfigError, MesoError
 
-
 MESOS = "sheet, groove, spheres, brick, blocks, grid, weave, pipes, chain, grass, squama, peanut, bark"
 """The built-in mesostructures, said here so that help does not wait for torch."""
 

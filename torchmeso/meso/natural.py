@@ -174,7 +174,11 @@ def peanut(
     size = smallest + (1 - smallest) * torch.rand(count, generator=rng)
     size = size.sort(descending=True).values / size.max()
     x, r = _cassini(h / 2, waist, segments)
-    centre, heading = _strew(size, x, r, rng)
+    layouts = (_strew(size, x, r, rng) for _ in range(8))
+    layout = next((places for places in layouts if places is not None), None)
+    if layout is None:
+        raise ConfigError(f"peanut.count: expected a number that finds room, got {count}; take fewer")
+    centre, heading = layout
     around = turn(segments)
     parts: list[tuple[Triangles, int]] = [(floor(h), 0)]
     for k in range(count):
@@ -221,12 +225,14 @@ def _cassini(radius: float, waist: float, segments: int) -> tuple[Float[Tensor, 
 
 def _strew(
     size: Float[Tensor, "count"], x: Float[Tensor, "n"], r: Float[Tensor, "n"], rng: torch.Generator
-) -> tuple[Float[Tensor, "count 2"], Float[Tensor, "count 2"]]:
-    """Return middles and headings so that none overlaps another; each lies as close to the others as it can.
+) -> tuple[Float[Tensor, "count 2"], Float[Tensor, "count 2"]] | None:
+    """Return middles and headings so that none overlaps another, or None where the last found no room.
+
+    One after the other is laid, of a thousand places the one as close to the others as can be.
 
     A peanut is taken for the balls of radius r at the places x along its axis.
     """
-    tries = 1024
+    tries = 1000
     x, r = x[::2], r[::2]  # balls this close together leave no room for another between them
     balls, radii = torch.zeros(0, 2), torch.zeros(0)
     centres, headings = [], []
@@ -241,7 +247,7 @@ def _strew(
         gap = room.amin(1) if len(balls) else torch.zeros(tries)
         chosen = int(torch.where(gap >= 0, gap, torch.inf).argmin())
         if float(gap[chosen]) < 0:
-            raise ConfigError(f"peanut.count: expected a number that finds room, got {len(size)}; take fewer")
+            return None
         balls, radii = torch.cat([balls, own[chosen]]), torch.cat([radii, size[k] * r])
         centres.append(centre[chosen])
         headings.append(heading[chosen])
