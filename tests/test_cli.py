@@ -1,5 +1,6 @@
 import json
 import os
+import re
 import subprocess
 import sys
 import time
@@ -13,6 +14,7 @@ from tests.pipeline.small import CONTENT
 from torchmeso.backends import opencl
 from torchmeso.cli import main
 from torchmeso.data import image, mdf
+from torchmeso.meso.generators import GENERATORS
 
 
 @pytest.fixture(autouse=True)
@@ -168,3 +170,9 @@ def test_importing_the_command_line_is_cheap():
 def test_png_keeps_colours(tmp_path):
     image.write_png(tmp_path / "a.png", torch.full((2, 2, 3), 0.5))
     assert "largest value: 0.5" in run("info", tmp_path / "a.png").stdout
+
+
+def test_help_names_every_mesostructure():
+    help_ = " ".join(run("bake", "--help").stdout.split())
+    for name in GENERATORS:
+        assert re.search(rf"\b{name}\b", help_), name

@@ -18,6 +18,9 @@ import click
 from torchmeso.backends.allocator import keep_freed_memory
 from torchmeso.errors import ConfigError, MesoError
 
+MESOS = "sheet, groove, spheres, brick, blocks, grid, weave, pipes, chain, grass, squama, peanut, bark"
+"""The built-in mesostructures, said here so that help does not wait for torch."""
+
 
 class _Group(click.Group):
     """A click group that prints our errors as one sentence and leaves with status 2."""
@@ -64,7 +67,7 @@ def demo(out: str) -> None:
 
 @main.command()
 @click.argument("configuration", required=False)
-@click.option("--meso", help="Mesostructure to bake alone: sheet, groove, spheres, brick, weave.")
+@click.option("--meso", help=f"Mesostructure to bake alone: {MESOS}.")
 @click.option("--out", help="With --meso the table (.btf.zarr or .mdf.zarr), else a folder; none = the cache.")
 @click.option("--texels", type=int, help="Side of the texture (default 64 for a BTF, 256 for an MDF).")
 @click.option("--lights", help="Light directions of a BTF [grid(12, 5, 80)].")

@@ -1,7 +1,7 @@
 import pytest
 
 from torchmeso.bench import frames
-from torchmeso.geometry import shapes
+from torchmeso.geometry import hemisphere, shapes
 from torchmeso.render.rasterize import rasterize
 from torchmeso.render.scene import Material, Object, Scene
 
@@ -13,6 +13,22 @@ def test_table_2_has_the_papers_triangles_and_rates():
         built = [o.build_shape() for o in rows[name].config.objects]
         assert abs(sum(len(m.faces) for m in built) - count) <= 0.01 * count, name
         assert rows[name].paper is not None
+
+
+def test_table_2_has_the_papers_materials_at_table_1s_resolutions():
+    expected = {"pipes": (64, 60), "brick": (64, 60), "peanut": (128, 96), "weave": (128, 96), "grass": (64, 96),
+                "blocks": (64, 60)}  # fmt: skip
+    found = {name: {} for name, _ in frames.table_2()}
+    for name, timed in frames.table_2():
+        for item in timed.config.materials.values():
+            assert item.meso is not None
+            found[name][item.meso.type] = (item.btf.texels, len(hemisphere.parse(item.btf.lights)))
+            assert item.mdf.texels == item.btf.texels
+            assert len(hemisphere.parse(item.mdf.views)) == len(hemisphere.parse(item.btf.views))
+    assert {k: v for row in found.values() for k, v in row.items()} == expected
+    assert [list(row) for row in found.values()] == [
+        ["pipes"], ["weave", "peanut"], ["brick", "grass"], ["weave"], ["blocks"], ["brick"]
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize("coverage", [0.28, 0.5, 1.0])

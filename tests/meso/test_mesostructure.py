@@ -28,6 +28,16 @@ def test_height_field_is_closed_over_the_border(rng):
     assert torch.isfinite(D).all()
 
 
+@pytest.mark.parametrize("texels", [5, 48, 100])
+def test_border_has_no_crack(texels, rng):
+    """Rays straight down on the vertices of the border themselves; most texel counts are no powers of two."""
+    z = -0.2 * torch.rand(texels, texels, generator=rng)
+    meso = mesostructure.from_height_field(HeightField(height=z - z.max(), albedo=None, h=0.2))
+    uv = meso.geometry.vertices[:, :2]
+    D = RayCastMdf(meso).evaluate(uv, torch.tensor([0.0, 0.0, 1.0]).expand(len(uv), 3))
+    assert torch.isfinite(D).all()
+
+
 def test_colour_follows_the_picture():
     albedo = torch.zeros(4, 4, 3)
     albedo[0, :, 0] = 1  # the top row is red

@@ -3,7 +3,7 @@ import torch
 
 from tests.pipeline.small import small
 from torchmeso.data import image
-from torchmeso.errors import FormatError
+from torchmeso.errors import FormatError, human_size
 from torchmeso.pipeline import bake, describe
 
 
@@ -20,6 +20,9 @@ def test_tables_and_models():
     about = describe.file(bake.model_path(brick))
     assert (about["rank"], about["storage"]) == (2, "uint8")
     assert about["MDF"] == "grid(6, 3, 87.5), h = 0.1 tiles"
+    assert about["MDF data"] == human_size(18 * 16**2)
+    # Eight lights, 8 x 8 texels, two terms of rgb in bytes; float32 weights of eight views, scales and offsets.
+    assert about["BTF data"] == human_size(8 * 8 * 8 * 2 * 3 + 4 * (8 * 2 + 2 * 2 * 3))
 
 
 def test_other_files(tmp_path):

@@ -344,7 +344,7 @@ MEASUREMENTS = [
 
 
 def figure12() -> Config:
-    """Return Fig. 12's scene: weave on tori, pebbles (spheres) on the floor."""
+    """Return Fig. 12's scene: weave on tori, peanuts on the floor."""
     return config.load(built_in("fig12"))
 
 

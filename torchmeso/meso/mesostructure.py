@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from torchmeso.data.height_field import HeightField
 from torchmeso.errors import GeometryError, check_range
@@ -62,8 +64,8 @@ def from_height_field(
     """
     height, width = field.height.shape
     column, row = torch.arange(width + 1), torch.arange(height + 1)
-    u = (column + 0.5) / width
-    v = 1 - (row + 0.5) / height
+    u = _exact((column % width + 0.5) / width) + column // width
+    v = _exact(1 - (row % height + 0.5) / height) - row // height
     z = field.height.float()[row % height][:, column % width]
     grid_u, grid_v = torch.meshgrid(u, v, indexing="xy")
     vertices = torch.stack([grid_u, grid_v, z], -1).reshape(-1, 3)
@@ -102,6 +104,11 @@ def from_file(
     part = torch.zeros(len(faces), dtype=torch.long)
     geometry = Geometry(vertices=vertices, faces=faces, part=part, palette=palette((albedo, roughness, f0)))
     return Mesostructure(geometry=geometry, h=depth)
+
+
+def _exact(x: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
+    """Round to multiples of 2^-22, so that moving by whole tiles is exact and the border closes without a crack."""
+    return (x * (1 << 22)).round() / (1 << 22)
 
 
 def palette(*parts: tuple[Rgb, float, float]) -> Palette:

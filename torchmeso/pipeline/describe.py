@@ -82,9 +82,11 @@ def _model(path: Path) -> dict[str, Any]:
             "views": eigen["views"],
             "texels": f"{first.shape[2]} x {first.shape[1]}",
             "storage": str(first.dtype).removeprefix("torch."),
+            "BTF data": _held(model, "eigen."),
         }
     if "mdf" in model.meta:
         about["MDF"] = f"{model.meta['mdf']['directions']}, h = {model.meta['mdf']['h']:g} tiles"
+        about["MDF data"] = _held(model, "mdf.")
     return {**about, "on disk": _size(path)}
 
 
@@ -117,6 +119,12 @@ def _mesh(path: Path) -> dict[str, Any]:
 
 def _origin(about: dict[str, Any]) -> dict[str, Any]:
     return {"made from": about["source"]} if "source" in about else {}
+
+
+def _held(model: store.Model, prefix: str) -> str:
+    """Return the size of a model's tensors whose names begin with `prefix`."""
+    tensors = (model.read(name) for name in model.names() if name.startswith(prefix))
+    return human_size(sum(x.numel() * x.element_size() for x in tensors))
 
 
 def _size(path: Path) -> str:
