@@ -1,7 +1,7 @@
 // A frame: tiles of the camera's picture are filled, tested and shaded while they lie in the cache.
 // Host: torchmeso/render/renderer.py
 //
-// Compiled with SILHOUETTE (see silhouette.clh) and ONE_LAYER.
+// Compiled with SILHOUETTE and MIXED (see silhouette.clh), and ONE_LAYER.
 
 #include "data/eigen_btf.clh"
 #include "render/silhouette.clh"

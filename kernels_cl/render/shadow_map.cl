@@ -1,7 +1,7 @@
 // The light's pass: which triangle the nearest shadow starts on, and how far behind it.
 // Host: torchmeso/render/shadow_map.py
 //
-// Compiled with SILHOUETTE (see silhouette.clh).
+// Compiled with SILHOUETTE and MIXED (see silhouette.clh).
 
 #include "render/silhouette.clh"
 #include "render/shadow_map.clh"

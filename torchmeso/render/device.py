@@ -39,7 +39,8 @@ FACET = np.dtype(
     + [(name, "f4") for name in ("turn", "scale")]
     + [("normal", "f4", 3), ("corner", "i4", 3), ("first", "f4", 3), ("second", "f4", 3)]
 )
-"""A face as kernels read it, in one line of the cache; see `Facet` in kernels_cl/render/scene.clh."""
+"""A face as kernels read it, in one line of the cache; see `Facet` in kernels_cl/render/scene.clh. What kernels call an
+object is a surface here (`Scene.surfaces`): an object in one of its materials."""
 
 REFLECTANCE = np.dtype(
     [(name, "i4") for name in ("there", "height", "width", "groups", "codes", "light_rings", "light_count")]
@@ -86,9 +87,9 @@ class DeviceMaterials(NamedTuple):
 
     Attributes:
         tables: everything that is looked up.
-        mdfs: (object,) see `MDF`.
-        reflectances: (object,) see `REFLECTANCE`.
-        textured: whether any object has a mesostructure.
+        mdfs: (surface,) see `MDF`.
+        reflectances: (surface,) see `REFLECTANCE`.
+        textured: whether any surface has a mesostructure.
         parts: the BTFs and MDFs in `tables`, by identity.
         packed: how many of them were uploaded, not taken over.
     """
@@ -116,21 +117,21 @@ def upload_geometry(world: World) -> DeviceGeometry:
     Raises:
         BackendError: there is no device.
     """
-    tags = torch.stack([(world.component << 2) | (world.closed[world.component].long() << 1), world.owner], 1)
+    tag = (world.component << 2) | (world.closed[world.component].long() << 1)
     return DeviceGeometry(
-        upload_mesh(world.vertices, world.faces, tags),
+        upload_mesh(world.vertices, world.faces, torch.stack([tag, world.object[world.owner]], 1)),
         opencl.upload(vertex_records(world)),
-        opencl.upload(face_records(world, tags)),
+        opencl.upload(face_records(world, torch.stack([tag, world.owner], 1))),
     )
 
 
 def upload_materials(
     materials: Sequence[Material], *, silhouettes: bool, ambient: bool, before: DeviceMaterials | None = None
 ) -> DeviceMaterials:
-    """Return the materials of a scene's objects on the device.
+    """Return the materials of a scene's surfaces on the device.
 
     Args:
-        materials: of each object.
+        materials: of each surface.
         silhouettes: whether the mesostructure has depth; without, MDFs are not read.
         ambient: whether the ambient term is needed.
         before: what stands on the device already; BTFs and MDFs that are the same objects are taken over from there.
@@ -205,7 +206,7 @@ def vertex_records(world: World) -> Float[np.ndarray, "V 16"]:
 
 
 def face_records(world: World, tags: Int[Tensor, "F 2"]) -> np.ndarray:
-    """Return what is asked of each face, see `FACET`; `tags` are those of `upload_mesh`."""
+    """Return what is asked of each face, see `FACET`; `tags` are as those of `upload_mesh`, of surfaces."""
     p, n = world.vertices.double()[world.faces], normalize(world.normals.double())[world.faces]
     e1, e2 = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
     normal = normalize(torch.linalg.cross(e1, e2))
