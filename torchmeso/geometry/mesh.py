@@ -13,14 +13,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchmeso.errors import FormatError, GeometryError, check_shape
-from torchmeso.geometry import components
+from torchmeso.errors import GeometryError, check_shape
+from torchmeso.geometry import components, mesh_file
 from torchmeso.geometry.directions import dot, normalize
+from torchmeso.geometry.mesh_file import MeshFile
 
 CREASE_DEG = 60.0
 """Faces that meet at a sharper angle (degrees between normals) do not share a vertex normal."""
@@ -68,58 +68,50 @@ class Mesh:
         check_shape("mesh.component", self.component, (len(self.faces),))
 
 
-def load(path: str | Path) -> Mesh:
-    """Return the mesh of a file that trimesh reads (OBJ, PLY, GLB, OFF, STL), dressed.
+def load(path: str | Path, *, uv_set: int = 0) -> Mesh:
+    """Return the mesh of a file (OBJ, glTF, PLY, OFF, STL; see `mesh_file.read`), dressed.
 
     Raises:
         FormatError: the file is missing or unreadable.
         GeometryError: it has no triangles, or no texture coordinates (`unwrap.unwrap` makes some).
     """
-    vertices, faces, uv = read_arrays(path)
-    if uv is None:
-        raise GeometryError(
-            f"{Path(path).name}: expected texture coordinates, got none; "
-            "make some with `unwrap: true` in the configuration (or torchmeso.geometry.unwrap), which cuts seams"
-        )
-    return dress(vertices, faces, uv, name=Path(path).name)
+    return dress_file(mesh_file.read(path, uv_set=uv_set), name=Path(path).name)
 
 
-def read_arrays(path: str | Path) -> tuple[Float[Tensor, "V 3"], Int[Tensor, "F 3"], Float[Tensor, "V 2"] | None]:
-    """Return vertices, faces and texture coordinates (None where the file has none) of a mesh file.
+def dress_file(found: MeshFile, *, tiles: tuple[float, float] = (1.0, 1.0), name: str = "mesh") -> Mesh:
+    """Return the mesh of a file that was read, its texture repeated `tiles` times along u and v.
+
+    Tangent frames that a file gives are kept: normal maps are made for them.
 
     Raises:
-        FormatError: the file is missing or unreadable.
-        GeometryError: it holds no triangles, or coordinates that are not finite.
+        GeometryError: there are no texture coordinates, or none that cover anything.
     """
-    import trimesh
+    if found.uv is None:
+        raise GeometryError(
+            f"{name}: expected texture coordinates, got none; "
+            "make some with `unwrap: true` in the configuration (or torchmeso.geometry.unwrap), which cuts seams"
+        )
+    given = None
+    if found.normals is not None and found.tangents is not None:
+        given = Frames(found.normals, found.tangents[:, :3], found.tangents[:, 3])
+    return dress(found.vertices, found.faces, found.uv * torch.tensor(tiles), given=given, name=name)
 
-    path = Path(path)
-    if not path.is_file():
-        raise FormatError(f"{path}: expected a mesh file, found none; check the path")
-    try:
-        loaded = trimesh.load(path, process=False)
-    except Exception as error:  # trimesh raises whatever its many readers raise
-        raise FormatError(f"{path}: trimesh could not read it ({type(error).__name__}: {error})") from error
-    parts = list(loaded.dump()) if isinstance(loaded, trimesh.Scene) else [loaded]
-    parts = [part for part in parts if isinstance(part, trimesh.Trimesh) and len(part.faces)]
-    if not parts:
-        raise GeometryError(f"{path.name}: expected triangles, got none")
-    uvs = [getattr(part.visual, "uv", None) for part in parts]
-    first = np.cumsum([0, *(len(part.vertices) for part in parts)])
-    vertices = torch.from_numpy(np.concatenate([part.vertices for part in parts]).astype(np.float32))
-    faces = torch.from_numpy(
-        np.concatenate([part.faces + n for part, n in zip(parts, first[:-1], strict=True)]).astype(np.int64)
-    )
-    if not torch.isfinite(vertices).all():
-        raise GeometryError(f"{path.name}: expected finite vertex positions, got NaN or infinity")
-    found = [uv for uv in uvs if uv is not None and len(uv)]
-    if len(found) < len(parts):
-        return vertices, faces, None
-    return vertices, faces, torch.from_numpy(np.concatenate(found).astype(np.float32))
+
+class Frames(NamedTuple):
+    """Tangent frames of vertices as they were given; see `Mesh`."""
+
+    normals: Float[Tensor, "V 3"]
+    tangents: Float[Tensor, "V 3"]
+    sign: Float[Tensor, "V"]
 
 
 def dress(
-    vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], uv: Float[Tensor, "V 2"], *, name: str = "mesh"
+    vertices: Float[Tensor, "V 3"],
+    faces: Int[Tensor, "F 3"],
+    uv: Float[Tensor, "V 2"],
+    *,
+    given: Frames | None = None,
+    name: str = "mesh",
 ) -> Mesh:
     """Return a Mesh: orientation mended, normals, tangents, texture scale and components found.
 
@@ -129,6 +121,7 @@ def dress(
         vertices: (V, 3) world positions; equal positions are one point of the surface.
         faces: (F, 3) vertex numbers; faces without area stay but take no part in the frames.
         uv: (V, 2) in tiles.
+        given: tangent frames to be kept; None = they are found, and vertices split where they jump.
         name: what warnings and errors call the mesh.
 
     Raises:
@@ -148,15 +141,29 @@ def dress(
     _warn_about_anisotropy(name, jacobian, usable)
 
     position = components.weld(vertices)
+    if given is not None:
+        given = _turned(given, faces[flip])
+        scale = _texture_scale(jacobian, usable, faces, _groups(position, given.normals))
+        return Mesh(
+            vertices=vertices,
+            faces=faces,
+            uv=uv,
+            normals=given.normals,
+            tangents=given.tangents,
+            sign=given.sign,
+            scale=scale.to(vertices.dtype),
+            component=found.of_face,
+            closed=found.closed,
+        )
     corner_normal = _corner_normals(vertices, faces, position)
     handed = torch.where(jacobian.uv_area < 0, -1.0, 1.0)
     split = _split(faces, corner_normal, handed)
     source = split.source
     normals = corner_normal.reshape(-1, 3)[split.corner]
-    group = torch.unique(torch.cat([position[source, None].double(), normals.double()], 1), dim=0, return_inverse=True)
-    scale = _texture_scale(jacobian, usable, split.faces, group[1])
+    group = _groups(position[source], normals)
+    scale = _texture_scale(jacobian, usable, split.faces, group)
     sign = handed[split.corner // 3]
-    tangents = _tangents(jacobian, usable, split.faces, normals, 2 * group[1] + (sign < 0))
+    tangents = _tangents(jacobian, usable, split.faces, normals, 2 * group + (sign < 0))
     return Mesh(
         vertices=vertices[source],
         faces=split.faces,
@@ -189,6 +196,19 @@ def transform(mesh: Mesh, matrix: Float[Tensor, "4 4"]) -> Mesh:
         tangents=(mesh.tangents.double() @ rotation.T).to(dtype),
         scale=mesh.scale * size.to(dtype),
     )
+
+
+def _turned(given: Frames, faces: Int[Tensor, "n 3"]) -> Frames:
+    """Return frames that fit the vertices of `faces` that were turned around: n turns, t and b stay."""
+    side = torch.ones_like(given.sign)
+    side[faces.flatten()] = -1
+    return Frames(given.normals * side[:, None], given.tangents, given.sign * side)
+
+
+def _groups(position: Int[Tensor, "V"], normals: Float[Tensor, "V 3"]) -> Int[Tensor, "V"]:
+    """Return a number for each vertex; those at one position with one normal share it."""
+    key = torch.cat([position[:, None].double(), normals.double()], 1)
+    return torch.unique(key, dim=0, return_inverse=True)[1]
 
 
 class _Jacobian(NamedTuple):
