@@ -3,7 +3,7 @@
 //
 // Compiled with SILHOUETTE and MIXED (see silhouette.clh), and ONE_LAYER.
 
-#include "data/eigen_btf.clh"
+#include "data/textured.clh"
 #include "render/silhouette.clh"
 #include "render/shadow_map.clh"
 
@@ -85,12 +85,15 @@ static void shade_object(const Place *place, __global const Reflectance *reflect
     __global const uchar *tables = place->tables;
     const Vector3 towards = {-rays->direction.x, -rays->direction.y, -rays->direction.z};
     const Vector3 wo = to_local(&seen->at, towards);
-    const float4 albedo = {reflectance->albedo[0], reflectance->albedo[1], reflectance->albedo[2], 0.0f};
+    const int eigen = reflectance->there == EIGEN;
     Footprint view;
     Taps taps;
     Weights first;
-    float4 T[16];
-    if (reflectance->there) {
+    Vector3 normal;
+    float4 T[16], albedo[16];
+    if (!eigen) {
+        normal = diffuse_at(tables, reflectance, seen->at.u, seen->at.v, bits, albedo);
+    } else {
         view = footprint(TABLE(Ring, tables, reflectance->view_rings), reflectance->view_count, wo);
         taps = bilinear(seen->at.u, seen->at.v, reflectance->height, reflectance->width);
         first = view_weights(tables, reflectance, 0, &view, bits);
@@ -107,12 +110,11 @@ static void shade_object(const Place *place, __global const Reflectance *reflect
         const int arrives = bits & ~blocked[i] & to_bits((wi.z > 0.0f) & (falloff * most > 0.0f));
         lit |= arrives;
         if (!arrives) continue;
-        if (!reflectance->there) {
-            const float16 share = falloff * wi.z * (1.0f / PI);
-            const Floats part = {share};
+        if (!eigen) {
+            const Floats part = {falloff * MAX(dot3(normal, wi), (float16)0.0f) * (1.0f / PI)};
             for (int b = arrives; b; b &= b - 1) {
                 const int l = __builtin_ctz(b);
-                rgb[l] += power * albedo * part.lane[l];
+                rgb[l] += power * albedo[l] * part.lane[l];
             }
             continue;
         }
@@ -130,8 +132,12 @@ static void shade_object(const Place *place, __global const Reflectance *reflect
 
     const int dark = frame->ambient_paper ? bits & ~lit : bits;
     if (frame->ambient <= 0.0f || !dark) return;
-    if (!reflectance->there) {
-        for (int b = dark; b; b &= b - 1) rgb[__builtin_ctz(b)] += frame->ambient * albedo;
+    if (!eigen) {
+        const Floats open = {0.5f * (1.0f + normal.z)};
+        for (int b = dark; b; b &= b - 1) {
+            const int l = __builtin_ctz(b);
+            rgb[l] += frame->ambient * open.lane[l] * albedo[l];
+        }
         return;
     }
     reflect_ambient(tables, reflectance, &view, &first, &taps, dark, T);

@@ -8,6 +8,7 @@ from tests.render.scenes import camera, sun
 from torchmeso.compress import eigen
 from torchmeso.compress.eigen import EigenOptions
 from torchmeso.data import eigen_btf
+from torchmeso.data.textured import Textured
 from torchmeso.errors import BackendError
 from torchmeso.geometry import hemisphere, mesh, shapes
 from torchmeso.geometry.light import PointLight, SpotLight
@@ -395,3 +396,24 @@ def test_a_material_on_other_faces_is_uploaded(brick, device):
         scene = replace(first, objects=(o,))
         renderer.update(scene)
         assert torch.equal(renderer.render(view).rgb, Renderer(scene).render(view).rgb)
+
+
+@pytest.mark.parametrize("rule", ["add", "paper"])
+def test_pictures_of_colours_and_normals(rule, brick, device, rng):
+    """Two sizes of maps, a mirrored texture, a part with depth below a normal map: the same picture as torch."""
+    lean = torch.randn(7, 12, 3, generator=rng) * 0.5 + torch.tensor([0.0, 0.0, 1.0])
+    looks = Material(btf=Textured(albedo=torch.rand(16, 9, 3, generator=rng), normals=lean))
+    colours = Material(btf=Textured(albedo=torch.rand(8, 8, 3, generator=rng)), mdf=brick.mdf)
+    body = shapes.torus(tiles=(6, 2), triangles=600)
+    mirrored = mesh.dress(body.vertices, body.faces, body.uv * torch.tensor([-1.0, 1.0]))
+    assert (mirrored.sign < 0).all()
+    objects = (
+        patched(mirrored, looks, brick, height=0.1),
+        Object(mesh=moved(shapes.plane(size=(6.0, 6.0), tiles=(4, 4)), y=-0.6), material=looks),
+        Object(mesh=moved(shapes.sphere(radius=0.4, triangles=300), y=0.6), material=colours),
+    )
+    scene = Scene(objects=objects, lights=LIGHTS["spot"], ambient=0.3, ambient_rule=rule)
+    exact, fast, wrong = compare(scene, camera((1.5, 2.0, 3.5), size=96), FrameOptions(shadow_map_size=128))
+    assert wrong <= 4
+    alike = (exact.owner == fast.owner) & (exact.shadowed == fast.shadowed).all(0)
+    assert (exact.rgb - fast.rgb)[alike].abs().quantile(0.99) < 1e-4

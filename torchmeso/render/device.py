@@ -20,6 +20,7 @@ from torchmeso.backends import opencl
 from torchmeso.data.eigen_btf import EigenBtf
 from torchmeso.data.mdf import Mdf
 from torchmeso.data.relief import CODES as RELIEF_CODES
+from torchmeso.data.textured import Textured
 from torchmeso.errors import BackendError
 from torchmeso.geometry import hemisphere
 from torchmeso.geometry.directions import normalize
@@ -45,8 +46,12 @@ object is a surface here (`Scene.surfaces`): an object in one of its materials."
 REFLECTANCE = np.dtype(
     [(name, "i4") for name in ("there", "height", "width", "groups", "codes", "light_rings", "light_count")]
     + [(name, "i4") for name in ("view_rings", "view_count", "maps", "weights", "scale", "offset", "ambient")]
-    + [("last_cosine", "f4"), ("albedo", "f4", 3), ("pad", "i4", 14)]
+    + [("last_cosine", "f4"), ("albedo", "f4", 3)]
+    + [(name, "i4") for name in ("normal_height", "normal_width", "normals")]
+    + [("pad", "i4", 11)]
 )
+EIGEN, TEXTURED = 1, 2
+"""What stands in a reflectance's `there`; 0 = a plain colour."""
 
 MDF = np.dtype(
     [(name, "i4") for name in ("there", "height", "width", "rings", "ring_count", "delta", "missing")]
@@ -62,7 +67,7 @@ LIGHT = np.dtype(
 
 
 ADDRESSES = {
-    REFLECTANCE: ("light_rings", "view_rings", "maps", "weights", "scale", "offset", "ambient"),
+    REFLECTANCE: ("light_rings", "view_rings", "maps", "weights", "scale", "offset", "ambient", "normals"),
     MDF: ("rings", "delta", "missing", "relief", "plateau", "hole"),
 }
 """Fields that say on which block a table begins; -1 = there is none."""
@@ -139,7 +144,7 @@ def upload_materials(
     Raises:
         BackendError: there is no device, or a material is of a kind that kernels do not read.
     """
-    wanted: dict[tuple[int, bool], EigenBtf | Mdf] = {}
+    wanted: dict[tuple[int, bool], EigenBtf | Textured | Mdf] = {}
     for m in materials:
         if m.btf is not None:
             wanted[id(m.btf), ambient] = _readable(m.btf)
@@ -164,7 +169,9 @@ def upload_materials(
 
 
 def _join(
-    kept: "dict[tuple[int, bool], _Part]", new: "dict[tuple[int, bool], EigenBtf | Mdf]", before: DeviceMaterials | None
+    kept: "dict[tuple[int, bool], _Part]",
+    new: "dict[tuple[int, bool], EigenBtf | Textured | Mdf]",
+    before: DeviceMaterials | None,
 ) -> "tuple[opencl.Buffer, dict[tuple[int, bool], _Part]]":
     """Return a buffer with the parts that are `kept`, copied on the device, and behind them the `new` ones."""
     parts, copies, blocks = {}, [], 0
@@ -175,7 +182,10 @@ def _join(
     arrays = []
     for key, source in new.items():
         pool = _Pool()
-        record = _reflectance(pool, source, ambient=key[1]) if isinstance(source, EigenBtf) else _mdf(pool, source)
+        if isinstance(source, EigenBtf):
+            record = _reflectance(pool, source, ambient=key[1])
+        else:
+            record = _pictures(pool, source) if isinstance(source, Textured) else _mdf(pool, source)
         arrays.append(pool.joined())
         parts[key] = _Part(source, blocks, len(arrays[-1]) // BLOCK, record)
         blocks += parts[key].blocks
@@ -236,8 +246,8 @@ def light_records(lights: tuple[Light, ...]) -> np.ndarray:
     return records
 
 
-def _readable(btf: object) -> EigenBtf:
-    if not isinstance(btf, EigenBtf):
+def _readable(btf: object) -> EigenBtf | Textured:
+    if not isinstance(btf, EigenBtf | Textured):
         raise BackendError(f"opencl: expected an eigen BTF, got {type(btf).__name__}; use the torch backend")
     return btf
 
@@ -259,7 +269,7 @@ def _reflectance(pool: "_Pool", btf: EigenBtf, *, ambient: bool) -> np.ndarray:
     scale, offset = _grouped(btf.scale.float()[None])[0], _grouped(btf.offset.float()[None])[0]
     by_channel = _grouped(weights[:, :, None].expand(-1, -1, 3))
     by_channel[:, :, 3] = _bounds(btf, weights)
-    record["there"], record["height"], record["width"], record["groups"] = 1, height, width, groups
+    record["there"], record["height"], record["width"], record["groups"] = EIGEN, height, width, groups
     record["codes"] = codes
     record["light_rings"], record["light_count"] = pool.add(_rings(btf.lights)), _ring_count(btf.lights)
     record["view_rings"], record["view_count"] = pool.add(_rings(btf.views)), _ring_count(btf.views)
@@ -269,6 +279,21 @@ def _reflectance(pool: "_Pool", btf: EigenBtf, *, ambient: bool) -> np.ndarray:
         record["ambient"] = pool.add(_grouped(btf.ambient_maps.float()).numpy())
     record["last_cosine"] = math.cos(btf.lights.last)
     return record
+
+
+def _pictures(pool: "_Pool", looks: Textured) -> np.ndarray:
+    record = np.zeros(1, REFLECTANCE)
+    record["there"], record["normals"] = TEXTURED, -1
+    record["height"], record["width"] = looks.albedo.shape[:2]
+    record["maps"] = pool.add(_of_four(looks.albedo))
+    if looks.normals is not None:
+        record["normal_height"], record["normal_width"] = looks.normals.shape[:2]
+        record["normals"] = pool.add(_of_four(looks.normals))
+    return record
+
+
+def _of_four(picture: Float[Tensor, "H W 3"]) -> Float[np.ndarray, "H W 4"]:
+    return torch.nn.functional.pad(picture.float(), (0, 1)).numpy()
 
 
 def _bounds(btf: EigenBtf, weights: Float[Tensor, "view rank"]) -> Float[Tensor, "view group"]:
