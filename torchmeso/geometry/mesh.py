@@ -207,8 +207,8 @@ def _turned(given: Frames, faces: Int[Tensor, "n 3"]) -> Frames:
 
 def _groups(position: Int[Tensor, "V"], normals: Float[Tensor, "V 3"]) -> Int[Tensor, "V"]:
     """Return a number for each vertex; those at one position with one normal share it."""
-    key = torch.cat([position[:, None].double(), normals.double()], 1)
-    return torch.unique(key, dim=0, return_inverse=True)[1]
+    normal = components.weld(normals)
+    return torch.unique(position * (normal.max() + 1) + normal, return_inverse=True)[1]
 
 
 class _Jacobian(NamedTuple):
@@ -265,21 +265,35 @@ def _corner_normals(vertices: Tensor, faces: Tensor, position: Tensor) -> Tensor
     to_next, to_last = normalize(p.roll(-1, 1) - p), normalize(p.roll(1, 1) - p)
     angle = torch.acos(dot(to_next, to_last).clamp(-1, 1)).flatten()
     around = position[faces].flatten()
-    order = torch.argsort(around, stable=True)
-    count = torch.bincount(around)
-    start = count.cumsum(0) - count
+    facing = face_normal.repeat_interleave(3, 0)
+    size = int(position.max()) + 1
 
+    # Where all faces lie within half the crease angle of their middle, no two of them meet at a crease.
+    middle = normalize(torch.zeros(size, 3, dtype=torch.float64).index_add_(0, around, facing))
+    least = torch.ones(size, dtype=torch.float64)
+    least.scatter_reduce_(0, around, dot(facing, middle[around]), "amin")
+    total = torch.zeros(size, 3, dtype=torch.float64).index_add_(0, around, facing * angle.unsqueeze(-1))
+    normal = total[around]
+    bent = (least < math.cos(math.radians(CREASE_DEG / 2)) + 1e-9)[around].nonzero()[:, 0]
+    normal[bent] = _over_creases(facing[bent], angle[bent], around[bent])
+    lost = normal.norm(dim=-1) < 1e-12  # around faces without area any unit vector will do
+    normal[lost] = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    return normalize(normal).to(vertices.dtype).reshape(-1, 3, 3)
+
+
+def _over_creases(facing: Tensor, angle: Tensor, around: Tensor) -> Tensor:
+    """Return (n, 3) sums of normals at corners whose position is `around`, over those not beyond a crease."""
+    order = torch.argsort(around, stable=True)
+    count = torch.bincount(around, minlength=1)
+    start = count.cumsum(0) - count
     # All pairs of corners at one position: corner i collects the face of corner j.
     pairs = count[around[order]]
     i = order.repeat_interleave(pairs)
     within = torch.arange(len(i)) - (pairs.cumsum(0) - pairs).repeat_interleave(pairs)
     j = order[start[around[i]] + within]
-    near = dot(face_normal[i // 3], face_normal[j // 3]) >= math.cos(math.radians(CREASE_DEG))
-    weighted = face_normal[j // 3] * (angle[j] * near).unsqueeze(-1)
-    normal = torch.zeros(3 * len(faces), 3, dtype=torch.float64).index_add_(0, i, weighted)
-    lost = normal.norm(dim=-1) < 1e-12  # around faces without area any unit vector will do
-    normal[lost] = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-    return normalize(normal).to(vertices.dtype).reshape(-1, 3, 3)
+    near = dot(facing[i], facing[j]) >= math.cos(math.radians(CREASE_DEG))
+    weighted = facing[j] * (angle[j] * near).unsqueeze(-1)
+    return torch.zeros(len(facing), 3, dtype=torch.float64).index_add_(0, i, weighted)
 
 
 class _Split(NamedTuple):
@@ -290,9 +304,9 @@ class _Split(NamedTuple):
 
 def _split(faces: Tensor, corner_normal: Tensor, handed: Tensor) -> _Split:
     """Split vertices so that each has one normal and one handedness."""
-    vertex = faces.flatten()[:, None].double()
-    key = torch.cat([vertex, corner_normal.reshape(-1, 3).double(), handed.repeat_interleave(3)[:, None]], 1)
-    unique, number = torch.unique(key, dim=0, return_inverse=True)
+    normal = components.weld(corner_normal.reshape(-1, 3))
+    key = 2 * (faces.flatten() * (normal.max() + 1) + normal) + (handed < 0).repeat_interleave(3)
+    unique, number = torch.unique(key, return_inverse=True)
     corner = torch.full((len(unique),), 3 * len(faces), dtype=torch.long)
     corner.scatter_reduce_(0, number, torch.arange(3 * len(faces)), "amin")
     return _Split(number.reshape(-1, 3), faces.flatten()[corner], corner)
