@@ -176,3 +176,19 @@ def test_help_names_every_mesostructure():
     help_ = " ".join(run("bake", "--help").stdout.split())
     for name in GENERATORS:
         assert re.search(rf"\b{name}\b", help_), name
+
+
+def test_export_writes_a_mesh_that_comes_back(tmp_path):
+    text = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl tile\nf 1/1 2/2 3/3\n"
+    (tmp_path / "a.obj").write_text(text)
+    assert run("export", tmp_path / "a.obj", "--to", tmp_path / "a.glb").stdout == f"{tmp_path / 'a.glb'}\n"
+    told = run("info", tmp_path / "a.glb").stdout
+    assert "parts: tile" in told
+    assert "tangents: from the file" in told
+
+
+@pytest.mark.errors
+def test_export_says_what_it_writes(tmp_path):
+    result = run("export", "a.obj", "--to", "a.fbx")
+    assert result.exit_code == 2
+    assert "expected a name that ends in .glb" in result.stderr

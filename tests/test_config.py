@@ -7,6 +7,7 @@ from torchmeso import config
 from torchmeso.config import CameraConfig, ObjectConfig, parse
 from torchmeso.errors import ConfigError, FormatError
 from torchmeso.geometry.light import DirectionalLight, PointLight, SpotLight
+from torchmeso.geometry.mesh_file import Finish
 
 CONFIGS = sorted((Path(__file__).parents[1] / "configs").glob("*.yaml"))
 
@@ -68,6 +69,23 @@ def test_objects_are_scaled_then_turned_then_moved():
     torch.testing.assert_close(moved, torch.tensor([1.0, 0, -2, 1]), rtol=0, atol=1e-6)
 
 
+def test_instances_stand_behind_the_objects_own_place():
+    instances = [{"translate": (0, 5, 0)}, {"rotate_deg": (0, 90, 0), "scale": 3}]
+    item = ObjectConfig(shape="sphere", material="x", scale=2, translate=(1, 0, 0), instances=instances)
+    first, second = item.places()
+    torch.testing.assert_close(first @ torch.tensor([1.0, 0, 0, 1]), torch.tensor([3.0, 5, 0, 1]), rtol=0, atol=1e-6)
+    torch.testing.assert_close(second @ torch.tensor([1.0, 0, 0, 1]), torch.tensor([0.0, 0, -9, 1]), rtol=0, atol=1e-5)
+    assert len(ObjectConfig(shape="sphere", material="x").places()) == 1
+
+
+def test_plain_materials_take_pictures():
+    settings = read(minimal(materials={"clay": {"albedo_map": "c.png", "normal_map": "n.png", "normal_scale": 2}}))
+    finish = settings.materials["clay"].finish
+    assert finish == Finish(
+        albedo=(1, 1, 1), albedo_map=Path("/somewhere/c.png"), normal_map=Path("/somewhere/n.png"), normal_scale=2
+    )
+
+
 def test_lights_and_camera():
     lights = [
         {"type": "directional", "direction": [0, 2, 0]},
@@ -103,6 +121,14 @@ REFUSED = [
     (minimal(objects=[{"shape": "sphere", "material": "cley"}]), "no material is called 'cley'; did you mean 'clay'"),
     (minimal(objects=[{"shape": "sfere", "material": "clay"}]), "got 'sfere'; did you mean 'sphere'"),
     (minimal(objects=[{"shape": "sphere", "material": "clay", "options": {"radios": 1}}]), "did you mean 'radius'"),
+    (minimal(objects=[{"mesh": "a.obj", "materials": {"skin": "cley"}}]), "called 'cley'; did you mean 'clay'"),
+    (minimal(objects=[{"shape": "sphere"}]), "a built-in 'shape' needs a 'material'"),
+    (
+        minimal(objects=[{"mesh": "a.obj", "instances": [{"rotate": 1}]}]),
+        r"instances\.0\.rotate'; did you mean 'rotate_deg'",
+    ),
+    (minimal(objects=[{"mesh": "a.obj", "tile_size": 1, "unwrap": {"iteration": 1}}]), "did you mean 'iterations'"),
+    (minimal(materials={"clay": {"meso": {"type": "brick"}, "normal_map": "n.png"}}), "'normal_map' belongs to"),
     (minimal(objects=[{"material": "clay"}]), "exactly one of 'shape' and 'mesh'"),
     (minimal(objects=[{"mesh": "a.obj", "material": "clay", "options": {"radius": 1}}]), "belong to built-in shapes"),
     (minimal(objects=[{"mesh": "a.obj", "material": "clay", "unwrap": True}]), "needs 'tile_size'"),

@@ -234,6 +234,21 @@ def _render_frames(settings: Any, out: str, truth: bool, force: bool, options: d
 
 
 @main.command()
+@click.argument("file")
+@click.option("--to", "out", required=True, help="The file to write: .glb (glTF 2.0).")
+@click.option("--force", is_flag=True, help="Replace an existing file.")
+def export(file: str, out: str, force: bool) -> None:
+    """Write the mesh FILE, or all objects of a configuration where they stand, with tangents for other renderers."""
+    from torchmeso.pipeline import export as job
+
+    if not out.lower().endswith(".glb"):
+        raise ConfigError(f"{out}: expected a name that ends in .glb")
+    _refuse_to_replace(out, force)
+    job.to_glb(file, out)
+    click.echo(out)
+
+
+@main.command()
 @click.argument("a")
 @click.argument("b")
 @click.option("--out", help="Picture of the difference (.png): four times the absolute difference.")

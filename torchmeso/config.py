@@ -25,7 +25,9 @@ from torchmeso.errors import ConfigError, FormatError, MesoError, did_you_mean
 from torchmeso.geometry.camera import Camera, look_at
 from torchmeso.geometry.light import DirectionalLight, Light, PointLight, SpotLight
 from torchmeso.geometry.mesh import Mesh
+from torchmeso.geometry.mesh_file import Finish
 from torchmeso.geometry.shapes import SHAPES
+from torchmeso.geometry.unwrap import UnwrapOptions
 from torchmeso.meso import mesostructure
 from torchmeso.meso.bake_btf import BtfOptions
 from torchmeso.meso.bake_mdf import MdfOptions
@@ -130,41 +132,89 @@ class MesoConfig(BaseModel):
 
 
 class MaterialConfig(_Strict):
-    """A mesostructure with how to bake and compress it; or a finished model; or a plain colour.
+    """A mesostructure with how to bake and compress it; or a finished model; or a plain colour with pictures.
 
-    `rank` reads only that many components of a model; the others stay on disk.
+    `rank` reads only that many components of a model; the others stay on disk. `albedo` multiplies `albedo_map`.
     """
 
     meso: MesoConfig | None = None
     model: str | None = None
     rank: int | None = Field(default=None, ge=1)
     albedo: Rgb | None = None
+    albedo_map: str | None = None
+    normal_map: str | None = None
+    normal_scale: float = 1.0
     btf: BtfOptions = Field(default_factory=BtfOptions)
     mdf: MdfOptions = Field(default_factory=MdfOptions)
     eigen: EigenOptions = Field(default_factory=EigenOptions)
 
     @model_validator(mode="after")
     def _check(self) -> "MaterialConfig":
-        if sum(x is not None for x in (self.meso, self.model, self.albedo)) != 1:
-            raise ValueError("expected exactly one of 'meso', 'model' (a .meso file) and 'albedo' (a plain colour)")
+        plain = self.albedo is not None or self.albedo_map is not None
+        if (self.meso is not None) + (self.model is not None) + plain != 1:
+            raise ValueError(
+                "expected exactly one of 'meso', 'model' (a .meso file) and 'albedo' or 'albedo_map' (a plain colour)"
+            )
+        if self.normal_map is not None and not plain:
+            raise ValueError("'normal_map' belongs to an 'albedo' or 'albedo_map'")
         if self.rank is not None and self.model is None:
             raise ValueError("'rank' belongs to a 'model'; a 'meso' has 'eigen: {rank: ...}'")
         return self
 
+    @property
+    def finish(self) -> Finish | None:
+        """The plain look, None where there is a mesostructure or a model."""
+        if self.albedo is None and self.albedo_map is None:
+            return None
+        return Finish(
+            albedo=self.albedo or (1.0, 1.0, 1.0),
+            albedo_map=None if self.albedo_map is None else Path(self.albedo_map),
+            normal_map=None if self.normal_map is None else Path(self.normal_map),
+            normal_scale=self.normal_scale,
+        )
 
-class ObjectConfig(_Strict):
-    """A built-in shape or a mesh file, its material, and where it stands."""
 
-    material: str
+class PlaceConfig(_Strict):
+    """Where something stands: scaled, then turned around x, y and z, then moved."""
+
+    scale: float = 1.0
+    rotate_deg: Vector = (0.0, 0.0, 0.0)
+    translate: Vector = (0.0, 0.0, 0.0)
+
+    def matrix(self) -> torch.Tensor:
+        """Return the 4 x 4 matrix."""
+        result = torch.eye(4, dtype=torch.float64) * self.scale
+        result[3, 3] = 1
+        for axis, angle in enumerate(self.rotate_deg):
+            a = torch.tensor(angle, dtype=torch.float64).deg2rad()
+            i, j = (axis + 1) % 3, (axis + 2) % 3
+            turn = torch.eye(4, dtype=torch.float64)
+            turn[i, i] = turn[j, j] = a.cos()
+            turn[j, i], turn[i, j] = a.sin(), -a.sin()
+            result = turn @ result
+        result[:3, 3] = torch.tensor(self.translate, dtype=torch.float64)
+        return result.float()
+
+
+class ObjectConfig(PlaceConfig):
+    """A built-in shape or a mesh file, its materials, and where it stands.
+
+    `material` is that of all parts, `materials` gives others to parts of a file (`usemtl`, materials of a glTF file);
+    parts without either look as their file says. `uv_set` chooses among a glTF file's texture coordinates; `unwrap`
+    (true, or options of the atlas) makes new ones at one `tile_size`. `instances` are further places, each applied
+    after the object's own; the mesh is read once.
+    """
+
+    material: str | None = None
+    materials: dict[str, str] = Field(default_factory=dict)
     shape: str | None = None
     mesh: str | None = None
     options: dict[str, Any] = Field(default_factory=dict)
     tiles: float | tuple[float, float] | None = None
-    unwrap: bool = False
+    uv_set: int = Field(default=0, ge=0)
+    unwrap: bool | UnwrapOptions = False
     tile_size: float | None = None
-    scale: float = 1.0
-    rotate_deg: Vector = (0.0, 0.0, 0.0)
-    translate: Vector = (0.0, 0.0, 0.0)
+    instances: list[PlaceConfig] = Field(default_factory=list)
 
     @model_validator(mode="after")
     def _check(self) -> "ObjectConfig":
@@ -177,6 +227,8 @@ class ObjectConfig(_Strict):
             for key in self.options:
                 if key not in known:
                     raise ValueError(f"{self.shape} has no option '{key}'{did_you_mean(key, known)}")
+            if self.material is None or self.materials or self.uv_set:
+                raise ValueError("a built-in 'shape' needs a 'material'; 'materials' and 'uv_set' belong to a 'mesh'")
         elif self.options:
             raise ValueError("'options' belong to built-in shapes")
         if self.unwrap and (self.mesh is None or self.tile_size is None):
@@ -200,19 +252,15 @@ class ObjectConfig(_Strict):
             return 1.0, 1.0
         return self.tiles if isinstance(self.tiles, tuple) else (self.tiles, self.tiles)
 
-    def matrix(self) -> torch.Tensor:
-        """Return the 4 x 4 matrix: scale, then turns around x, y and z, then the translation."""
-        result = torch.eye(4, dtype=torch.float64) * self.scale
-        result[3, 3] = 1
-        for axis, angle in enumerate(self.rotate_deg):
-            a = torch.tensor(angle, dtype=torch.float64).deg2rad()
-            i, j = (axis + 1) % 3, (axis + 2) % 3
-            turn = torch.eye(4, dtype=torch.float64)
-            turn[i, i] = turn[j, j] = a.cos()
-            turn[j, i], turn[i, j] = a.sin(), -a.sin()
-            result = turn @ result
-        result[:3, 3] = torch.tensor(self.translate, dtype=torch.float64)
-        return result.float()
+    @property
+    def used_materials(self) -> set[str]:
+        """Names of the materials it asks for."""
+        return set(self.materials.values()) | ({self.material} if self.material is not None else set())
+
+    def places(self) -> list[torch.Tensor]:
+        """Return the 4 x 4 matrix of every place it stands at."""
+        own = self.matrix()
+        return [(place.matrix().double() @ own.double()).float() for place in self.instances] or [own]
 
 
 class DirectionalConfig(_Strict):
@@ -306,7 +354,7 @@ class Config(_Strict):
     """Everything a picture needs."""
 
     name: str = "scene"
-    materials: dict[str, MaterialConfig]
+    materials: dict[str, MaterialConfig] = Field(default_factory=dict)
     objects: list[ObjectConfig] = Field(min_length=1)
     lights: list[LightConfig] = Field(default_factory=list)
     ambient: float = Field(default=0.05, ge=0)
@@ -319,11 +367,9 @@ class Config(_Strict):
 
     @model_validator(mode="after")
     def _check(self) -> "Config":
-        for item in self.objects:
-            if item.material not in self.materials:
-                raise ValueError(
-                    f"objects: no material is called '{item.material}'{did_you_mean(item.material, self.materials)}"
-                )
+        for name in sorted(set().union(*(item.used_materials for item in self.objects))):
+            if name not in self.materials:
+                raise ValueError(f"objects: no material is called '{name}'{did_you_mean(name, self.materials)}")
         return self
 
 
@@ -381,7 +427,7 @@ def data_dir() -> Path:
     return Path(os.environ.get("TORCHMESO_DATA", beside))
 
 
-PATH_KEYS = ("mesh", "model", "displacement", "albedo", "path")
+PATH_KEYS = ("mesh", "model", "displacement", "albedo", "albedo_map", "normal_map", "path")
 
 
 def _call(place: str, function: Callable[..., Any], arguments: dict[str, Any]) -> Any:
@@ -457,6 +503,8 @@ def _fields(kind: Any) -> dict[str, Any]:
     below = {
         "materials": MaterialConfig,
         "objects": ObjectConfig,
+        "instances": PlaceConfig,
+        "unwrap": UnwrapOptions,
         "camera": CameraConfig,
         "render": FrameOptions,
         "truth": TruthConfig,

@@ -1,9 +1,9 @@
 // A frame: tiles of the camera's picture are filled, tested and shaded while they lie in the cache.
 // Host: torchmeso/render/renderer.py
 //
-// Compiled with SILHOUETTE (see silhouette.clh) and ONE_LAYER.
+// Compiled with SILHOUETTE and MIXED (see silhouette.clh), and ONE_LAYER.
 
-#include "data/eigen_btf.clh"
+#include "data/textured.clh"
 #include "render/shadow_map.clh"
 
 // What a frame asks for.
@@ -85,23 +85,26 @@ static void shade_object(const Place *place, __global const Reflectance *reflect
     __global const uchar *tables = place->tables;
     const Vector3 towards = {-rays->direction.x, -rays->direction.y, -rays->direction.z};
     const Vector3 wo = to_local(&seen->at, towards);
-    const float4 albedo = {reflectance->albedo[0], reflectance->albedo[1], reflectance->albedo[2], 0.0f};
+    const int eigen = reflectance->there == EIGEN;
     Footprint view;
     Area area;
     Weights first;
-    float4 T[16];
-    if (reflectance->there) {
+    Vector3 normal;
+    float4 T[16], albedo[16];
+    const int filtered = frame->pixel > 0.0f;
+    float16 pixel = frame->pixel / seen->at.scale;
+    if (filtered && place->view->perspective) {
+        const Vector3 from_eye = {seen->position.x - rays->origin.x, seen->position.y - rays->origin.y,
+                                  seen->position.z - rays->origin.z};
+        const float16 depth = dot3(from_eye, rays->direction) / rays->stretch;
+        pixel *= MAX(depth, (float16)0.0f);
+    }
+    if (!eigen) {
+        normal = diffuse_at(tables, reflectance, seen->at.u, seen->at.v, wo, filtered, pixel, bits, albedo);
+    } else {
         view = footprint(TABLE(Ring, tables, reflectance->view_rings), reflectance->view_count, wo);
-        if (frame->pixel > 0.0f) {
-            const Vector3 from_eye = {seen->position.x - rays->origin.x, seen->position.y - rays->origin.y,
-                                      seen->position.z - rays->origin.z};
-            const float16 depth = dot3(from_eye, rays->direction) / rays->stretch;
-            const float16 pixel = place->view->perspective ? frame->pixel * depth : (float16)frame->pixel;
-            look_around(TABLE(Level, tables, reflectance->levels), reflectance->level_count, seen->at.u, seen->at.v, wo,
-                        MAX(pixel, (float16)0.0f) / seen->at.scale, bits, &area);
-        } else {
-            look_at_point(seen->at.u, seen->at.v, reflectance->height, reflectance->width, bits, &area);
-        }
+        look_around(TABLE(Level, tables, reflectance->levels), reflectance->level_count, seen->at.u, seen->at.v, wo,
+                    filtered, pixel, bits, &area);
         first = view_weights(tables, reflectance, 0, &view, bits);
     }
     int lit = 0;
@@ -116,12 +119,11 @@ static void shade_object(const Place *place, __global const Reflectance *reflect
         const int arrives = bits & ~blocked[i] & to_bits((wi.z > 0.0f) & (falloff * most > 0.0f));
         lit |= arrives;
         if (!arrives) continue;
-        if (!reflectance->there) {
-            const float16 share = falloff * wi.z * (1.0f / PI);
-            const Floats part = {share};
+        if (!eigen) {
+            const Floats part = {falloff * MAX(dot3(normal, wi), (float16)0.0f) * (1.0f / PI)};
             for (int b = arrives; b; b &= b - 1) {
                 const int l = __builtin_ctz(b);
-                rgb[l] += power * albedo * part.lane[l];
+                rgb[l] += power * albedo[l] * part.lane[l];
             }
             continue;
         }
@@ -139,8 +141,12 @@ static void shade_object(const Place *place, __global const Reflectance *reflect
 
     const int dark = frame->ambient_paper ? bits & ~lit : bits;
     if (frame->ambient <= 0.0f || !dark) return;
-    if (!reflectance->there) {
-        for (int b = dark; b; b &= b - 1) rgb[__builtin_ctz(b)] += frame->ambient * albedo;
+    if (!eigen) {
+        const Floats open = {0.5f * (1.0f + normal.z)};
+        for (int b = dark; b; b &= b - 1) {
+            const int l = __builtin_ctz(b);
+            rgb[l] += frame->ambient * open.lane[l] * albedo[l];
+        }
         return;
     }
     reflect_ambient(tables, reflectance, &view, &first, &area, dark, T);

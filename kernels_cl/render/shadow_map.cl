@@ -1,7 +1,7 @@
 // The light's pass: the layers of each stamp of a shadow map, or at once what stops the light there.
 // Host: torchmeso/render/shadow_map.py
 //
-// Compiled with SILHOUETTE (see silhouette.clh).
+// Compiled with SILHOUETTE and MIXED (see silhouette.clh).
 
 #include "render/shadow_map.clh"
 

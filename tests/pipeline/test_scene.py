@@ -1,9 +1,12 @@
 import pytest
 import torch
+from PIL import Image
 
 from tests.pipeline.small import small
 from torchmeso.config import ObjectConfig
-from torchmeso.errors import GeometryError
+from torchmeso.data.textured import Textured
+from torchmeso.errors import ConfigError, GeometryError
+from torchmeso.geometry import mesh_file
 from torchmeso.pipeline import bake, scene
 
 
@@ -43,6 +46,74 @@ def test_unwrapped_mesh_reports_its_seams(tmp_path):
     pytest.importorskip("xatlas")
     write_square(tmp_path / "a.obj", with_uv=False)
     item = ObjectConfig(mesh=str(tmp_path / "a.obj"), material="x", unwrap=True, tile_size=0.5)
-    with pytest.warns(UserWarning, match="texture seams are 0 world units long"):
+    with pytest.warns(
+        UserWarning, match=r"unwrapped into 1 charts; texture seams are 0 world units long \(0% of all edges\)"
+    ):
         body = scene.build_mesh(item)
     torch.testing.assert_close(body.scale, torch.full_like(body.scale, 0.5), rtol=1e-4, atol=0)
+
+
+TWO_PARTS = (
+    "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
+    "usemtl front\nf 1/1 2/2 3/3\nusemtl back\nf 1/1 3/3 4/4\n"
+)
+
+
+def two_parts(tmp_path, **changes):
+    (tmp_path / "a.obj").write_text(TWO_PARTS)
+    item = {"mesh": str(tmp_path / "a.obj"), **changes}
+    return small(objects=[item], materials={"red": {"albedo": [1, 0, 0]}, "blue": {"albedo": [0, 0, 1]}})
+
+
+def test_parts_get_the_materials_they_are_given(tmp_path):
+    settings = two_parts(tmp_path, material="red", materials={"back": "blue"})
+    (item,) = scene.build(settings, bake.prepare(settings)).objects
+    assert [m.albedo for m in item.materials] == [(1, 0, 0), (0, 0, 1)]
+    assert item.part is not None
+    assert item.part.tolist() == [0, 1]
+
+
+def test_parts_of_one_material_are_one(tmp_path):
+    settings = two_parts(tmp_path, material="red")
+    (item,) = scene.build(settings, bake.prepare(settings)).objects
+    assert (item.part, item.others) == (None, ())
+
+
+def test_parts_look_as_their_file_says(tmp_path):
+    Image.new("RGB", (2, 2), (255, 0, 0)).save(tmp_path / "c.png")
+    (tmp_path / "a.mtl").write_text("newmtl front\nmap_Kd c.png\nnewmtl back\nKd 0.1 0.2 0.3\n")
+    settings = two_parts(tmp_path)
+    (tmp_path / "a.obj").write_text("mtllib a.mtl\n" + TWO_PARTS)
+    (item,) = scene.build(settings, bake.prepare(settings)).objects
+    front, back = item.materials
+    assert isinstance(front.btf, Textured)
+    assert front.btf.albedo[0, 0].tolist() == [1, 0, 0]
+    assert back.albedo == (0.1, 0.2, 0.3)
+
+
+def test_instances_share_what_was_read(tmp_path, monkeypatch):
+    times = []
+    read = mesh_file.read
+    monkeypatch.setattr(mesh_file, "read", lambda *a, **k: times.append(a) or read(*a, **k))
+    places = [{"translate": [i, 0, 0]} for i in range(5)]
+    item = two_parts(tmp_path, material="red", instances=places).objects[0]
+    settings = small(
+        objects=[item.model_dump(), {**item.model_dump(), "instances": [], "translate": [0, 3, 0]}],
+        materials={"red": {"albedo": [1, 0, 0]}},
+    )
+    objects = scene.build(settings, bake.prepare(settings)).objects
+    assert len(times) == 1
+    assert [float(o.mesh.vertices[:, 0].min()) for o in objects] == [0, 1, 2, 3, 4, 0]
+    assert all(o.mesh.faces is objects[0].mesh.faces for o in objects)
+
+
+@pytest.mark.errors
+def test_parts_nobody_named(tmp_path):
+    settings = two_parts(tmp_path, material="red", materials={"bakc": "blue"})
+    with pytest.raises(ConfigError, match=r"a\.obj has no part 'bakc'; did you mean 'back'"):
+        scene.build(settings, bake.prepare(settings))
+    settings = two_parts(tmp_path, materials={"back": "blue"})
+    with pytest.raises(
+        ConfigError, match="expected a material for the part 'front', got none; name one in 'materials'"
+    ):
+        scene.build(settings, bake.prepare(settings))

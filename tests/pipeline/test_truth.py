@@ -3,8 +3,11 @@ import torch
 
 from tests.pipeline.small import small
 from torchmeso.errors import ConfigError
+from torchmeso.geometry import glb, shapes
+from torchmeso.geometry.glb import Body
 from torchmeso.geometry.light import DirectionalLight
-from torchmeso.pipeline import truth
+from torchmeso.geometry.mesh_file import Finish, Group
+from torchmeso.pipeline import render, truth
 from torchmeso.transport.tracer import MeshTracer
 
 CLAY = {"clay": {"albedo": [0.5, 0.25, 1.0]}}
@@ -69,3 +72,20 @@ def test_a_finished_model_has_no_known_geometry(tmp_path):
     settings = small(materials={**CLAY, "brick": {"model": str(tmp_path / "a.meso")}})
     with pytest.raises(ConfigError, match="expected the mesostructure of 'brick', got a finished model"):
         truth.geometries(settings)
+
+
+def test_parts_and_instances_are_told_by_object(tmp_path):
+    """A body of two looks at two places: the truth counts objects as the picture does."""
+    body = shapes.sphere(radius=0.6, triangles=300)
+    part = (body.vertices[body.faces].mean(1)[:, 1] > 0).long()
+    path = tmp_path / "ball.glb"
+    groups = (Group("lower", None), Group("upper", Finish(albedo=(0.9, 0.1, 0.1))))
+    path.write_bytes(glb.encode([Body("ball", body, part, groups)]))
+    ball = {"mesh": str(path), "materials": {"lower": "brick"}}
+    places = [{"translate": [-0.8, 0, 0]}, {"translate": [0.8, 0, 0]}]
+    settings = small(objects=[{**ball, "instances": places}, *small().model_dump()["objects"][1:]])
+    found, picture = truth.render(settings), render.render(settings).picture
+    assert set(found.owner.unique().tolist()) == set(picture.owner.unique().tolist()) == {-1, 0, 1, 2}
+    assert (picture.owner == found.owner).double().mean() > 0.95
+    red = (found.rgb[..., 0] > 2 * found.rgb[..., 1]) & (found.owner >= 0)
+    assert set(found.owner[red].tolist()) == {0, 1}

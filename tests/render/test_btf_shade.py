@@ -16,9 +16,8 @@ from torchmeso.render.scene import Material, Object, Points, Scene
 def points(n=1, owner=0):
     """Points at the origin of a level surface: t = x, b = y, n = z."""
     axes = torch.eye(3)[:, None].expand(3, n, 3)
-    return Points(
-        torch.zeros(n, 3), torch.rand(n, 2), Frame(*axes), torch.ones(n), torch.full((n,), owner, dtype=torch.long)
-    )
+    owners = torch.full((n,), owner, dtype=torch.long)
+    return Points(torch.zeros(n, 3), torch.rand(n, 2), Frame(*axes), torch.ones(n), owners, torch.zeros(n))
 
 
 def lit(subject, n=1, wo=(0.0, 0.0, 1.0), blocked=False):

@@ -9,6 +9,7 @@ from torchmeso.backends import opencl
 from torchmeso.compress import eigen
 from torchmeso.compress.eigen import EigenOptions
 from torchmeso.data import eigen_btf
+from torchmeso.data.textured import Textured
 from torchmeso.errors import BackendError
 from torchmeso.geometry import hemisphere, mesh, shapes
 from torchmeso.geometry.light import PointLight, SpotLight
@@ -404,3 +405,74 @@ def test_ranks_that_add_less_than_the_error(device):
         assert rough.counts["groups of components spared"] > 0
         # Two groups can be left out, and light and ambient both read the model.
         assert (rough.rgb - exact.rgb).abs().max() <= 2 * error * (1 + scene.ambient)
+
+
+def patched(body, *materials, height=0.0):
+    """A body with other materials above each of several heights."""
+    middle = body.vertices[body.faces].mean(1)[:, 1]
+    part = sum((middle > height + 0.15 * k).long() for k in range(len(materials) - 1))
+    return Object(mesh=body, material=materials[0], others=materials[1:], part=part)
+
+
+@pytest.mark.parametrize("light", ["sun", "point"])
+@pytest.mark.parametrize("silhouette", ["none", "paper", "curved"])
+def test_bodies_of_several_materials(silhouette, light, brick, weave, device):
+    """Brick, plain, the brick's depth without its colour, and a weave with holes: the same picture as torch."""
+    plain, bare = Material(albedo=(0.2, 0.6, 0.3)), Material(mdf=brick.mdf, albedo=(0.6, 0.2, 0.2))
+    objects = (
+        patched(moved(shapes.torus(tiles=(6, 2), triangles=600), y=0.3), brick, plain, bare, height=0.2),
+        patched(moved(shapes.sphere(radius=0.5, tiles=(6, 3), triangles=400), x=1.2, y=0.4), weave, brick, height=0.3),
+        Object(mesh=moved(shapes.plane(size=(6.0, 6.0), tiles=(4, 4)), y=-0.6), material=brick),
+    )
+    scene = Scene(objects=objects, lights=LIGHTS[light])
+    options = FrameOptions(silhouette=silhouette, shadow_map_size=128)
+    exact, fast, wrong = compare(scene, camera((1.5, 2.0, 3.5), size=96), options)
+    assert wrong <= 4
+    assert (exact.owner != fast.owner).sum() <= 2
+    assert set(exact.owner.unique().tolist()) == {-1, 0, 1, 2}
+    assert (exact.shadowed != fast.shadowed).sum() <= 4
+
+
+@pytest.mark.parametrize("silhouette", ["paper", "curved"])
+def test_a_material_cut_in_two_is_still_one(silhouette, brick, device):
+    """Where both parts of a body have the same material, nothing tells where one ends."""
+    body = shapes.torus(tiles=(6, 2), triangles=600)
+    whole = Scene(objects=(Object(mesh=body, material=brick),), lights=LIGHTS["sun"])
+    parts = replace(whole, objects=(patched(body, brick, replace(brick, albedo=(1.0, 0.0, 0.0))),))
+    view, options = camera((1.5, 2.0, 2.5)), FrameOptions(silhouette=silhouette, shadow_map_size=128)
+    for picture in (lambda s: frame.render(s, view, options), lambda s: Renderer(s, options).render(view)):
+        one, two = picture(whole), picture(parts)
+        assert torch.equal(one.depth, two.depth)
+        assert torch.equal(one.owner, two.owner)
+        torch.testing.assert_close(one.rgb, two.rgb, rtol=0, atol=1e-5)
+
+
+def test_a_material_on_other_faces_is_uploaded(brick, device):
+    body, plain = shapes.torus(triangles=400), Material()
+    first = Scene(objects=(patched(body, brick, plain),), lights=LIGHTS["sun"])
+    renderer, view = Renderer(first), camera((1.5, 2.0, 2.5))
+    for o in (patched(body, brick, plain, height=0.1), Object(mesh=body, material=brick, others=(plain, plain))):
+        scene = replace(first, objects=(o,))
+        renderer.update(scene)
+        assert torch.equal(renderer.render(view).rgb, Renderer(scene).render(view).rgb)
+
+
+@pytest.mark.parametrize("rule", ["add", "paper"])
+def test_pictures_of_colours_and_normals(rule, brick, device, rng):
+    """Two sizes of maps, a mirrored texture, a part with depth below a normal map: the same picture as torch."""
+    lean = torch.randn(7, 12, 3, generator=rng) * 0.5 + torch.tensor([0.0, 0.0, 1.0])
+    looks = Material(btf=Textured(albedo=torch.rand(16, 9, 3, generator=rng), normals=lean))
+    colours = Material(btf=Textured(albedo=torch.rand(8, 8, 3, generator=rng)), mdf=brick.mdf)
+    body = shapes.torus(tiles=(6, 2), triangles=600)
+    mirrored = mesh.dress(body.vertices, body.faces, body.uv * torch.tensor([-1.0, 1.0]))
+    assert (mirrored.sign < 0).all()
+    objects = (
+        patched(mirrored, looks, brick, height=0.1),
+        Object(mesh=moved(shapes.plane(size=(6.0, 6.0), tiles=(4, 4)), y=-0.6), material=looks),
+        Object(mesh=moved(shapes.sphere(radius=0.4, triangles=300), y=0.6), material=colours),
+    )
+    scene = Scene(objects=objects, lights=LIGHTS["spot"], ambient=0.3, ambient_rule=rule)
+    exact, fast, wrong = compare(scene, camera((1.5, 2.0, 3.5), size=96), FrameOptions(shadow_map_size=128))
+    assert wrong <= 4
+    alike = (exact.owner == fast.owner) & (exact.shadowed == fast.shadowed).all(0)
+    assert (exact.rgb - fast.rgb)[alike].abs().quantile(0.99) < 3e-4

@@ -4,12 +4,12 @@ import torch
 from tests.render.scenes import camera, scene, sun
 from tests.tolerances import FLOAT32
 from torchmeso.data.mdf import Mdf
-from torchmeso.errors import ConfigError
+from torchmeso.errors import ConfigError, ShapeError
 from torchmeso.geometry import hemisphere, shapes
 from torchmeso.meso import generators
 from torchmeso.meso.bake_mdf import RayCastMdf
 from torchmeso.render.rasterize import rasterize
-from torchmeso.render.scene import DistanceFunction, Scene, assemble, interpolate, rays
+from torchmeso.render.scene import DistanceFunction, Material, Object, Scene, assemble, interpolate, rays
 
 
 def test_assembled_meshes_keep_their_arrays():
@@ -81,3 +81,26 @@ def test_scenes_nobody_can_render_are_refused():
         Scene(objects=(), lights=(sun(0, 0, 1),))
     with pytest.raises(ConfigError, match=r"scene\.ambient_rule: expected 'add' or 'paper', got 'either'"):
         Scene(objects=scene(shapes.plane()).objects, lights=(), ambient_rule="either")
+
+
+def test_a_body_of_several_materials_stays_whole():
+    body = shapes.sphere(triangles=200)
+    part = (body.vertices[body.faces].mean(1)[:, 1] > 0).long()
+    red, blue = Material(albedo=(1.0, 0.0, 0.0)), Material(albedo=(0.0, 0.0, 1.0))
+    two = Object(mesh=body, material=red, others=(blue,), part=part)
+    subject = Scene(objects=(Object(mesh=shapes.plane(), material=blue), two), lights=())
+    world = assemble(subject)
+    assert subject.surfaces == (blue, red, blue)
+    assert world.object.tolist() == [0, 1, 1]
+    assert torch.equal(world.owner[2:], part + 1)
+    assert world.closed.tolist() == [False, True]
+
+
+@pytest.mark.errors
+def test_faces_without_a_material_are_refused():
+    body = shapes.sphere(triangles=200)
+    n = len(body.faces)
+    with pytest.raises(ConfigError, match=r"object\.part: expected a value from 0 to 0, got 1"):
+        Object(mesh=body, material=Material(), part=torch.ones(n, dtype=torch.long))
+    with pytest.raises(ShapeError, match=rf"object\.part: expected shape \({n}\), got \(3,\)"):
+        Object(mesh=body, material=Material(), part=torch.zeros(3, dtype=torch.long))

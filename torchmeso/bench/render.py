@@ -252,7 +252,9 @@ def shadow(context: Context) -> Iterator[Row]:
     settings = figure12()
     mesos = {name: m.meso.build() for name, m in settings.materials.items() if m.meso is not None}
     tables = {name: Material(mdf=bake_mdf.in_memory(m, MdfOptions())) for name, m in mesos.items()}
-    objects = tuple(Object(mesh=pipeline_scene.build_mesh(o), material=tables[o.material]) for o in settings.objects)
+    objects = tuple(
+        Object(mesh=pipeline_scene.build_mesh(o), material=tables[str(o.material)]) for o in settings.objects
+    )
     light, camera = settings.lights[0].build(), settings.camera.build()
     geometries = truth.geometries(settings)
     owner, depth, *rays = truth.first_hits(MeshTracer(*geometries), camera)

@@ -9,7 +9,6 @@ Test: tests/data/test_eigen_btf.py
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -101,12 +100,12 @@ class EigenBtf:
         def look_up(which: Tensor, uv: Tensor, level: int) -> Tensor:
             height, width = self.levels[level].shape[1:3]
             taps = address.bilinear(uv, height, width)
-            node, share = light.node[which], light.weight[which]
+            node, share = light.node.reshape(-1, 4)[which], light.weight.reshape(-1, 4)[which]
             index = (node[..., :, None] * (height * width) + taps.texel[..., None, :]).flatten(-2)
             weight = (share[..., :, None] * taps.weight[..., None, :]).flatten(-2)
             return (self._nodes[level][index].to(uv.dtype) * weight[..., None, None]).sum(-3)
 
-        E = self.offset.to(wo.dtype) + self.scale.to(wo.dtype) * self._mean(look_up, uv, seen)
+        E = self.offset.to(wo.dtype) + self.scale.to(wo.dtype) * pyramid.average(look_up, uv, seen, *self._size)
         return self._weighted(E, wo) * horizon_falloff(self.lights, wi)
 
     def ambient(
@@ -119,7 +118,7 @@ class EigenBtf:
             taps = address.bilinear(uv, *E.shape[:2])
             return (E.flatten(0, 1)[taps.texel].to(uv.dtype) * taps.weight[..., None, None]).sum(-3)
 
-        return self._weighted(self._mean(look_up, uv, seen), wo)
+        return self._weighted(pyramid.average(look_up, uv, seen, *self._size), wo)
 
     def view_weights(self, wo: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch rank"]:
         """Return W(wo), interpolated."""
@@ -130,19 +129,10 @@ class EigenBtf:
         """Return the eigen maps E as floating-point values."""
         return _decode(self.maps, self.scale, self.offset)
 
-    def _mean(
-        self, look_up: Callable[[Tensor, Tensor, int], Tensor], uv: Tensor, seen: Footprint | None
-    ) -> Float[Tensor, "*batch rank 3"]:
-        """Return what `look_up` (which points, uv, level) finds over the area that is seen."""
-        everywhere = torch.ones(uv.shape[:-1], dtype=torch.bool)
-        if seen is None:
-            return look_up(everywhere, uv.reshape(-1, 2), 0).reshape(*uv.shape[:-1], self.rank, 3)
-        mean = torch.zeros(*uv.shape[:-1], self.rank, 3, dtype=uv.dtype)
-        for probe in pyramid.probes(uv, seen, max(self.texels), len(self.levels)):
-            for level in probe.level.unique().tolist():
-                which = (probe.level == level) & (probe.weight > 0)
-                mean[which] += probe.weight[which][..., None, None] * look_up(which, probe.uv[which], level)
-        return mean
+    @property
+    def _size(self) -> tuple[int, int]:
+        """Texels along the longer side, and levels."""
+        return max(self.texels), len(self.levels)
 
     def _weighted(self, E: Tensor, wo: Tensor) -> Tensor:
         return (E * self.view_weights(wo).unsqueeze(-1)).sum(-2)

@@ -3,6 +3,7 @@
 Test: tests/data/test_image.py
 """
 
+import io
 from pathlib import Path
 
 import numpy as np
@@ -14,13 +15,16 @@ from torchmeso.data.store import replacing
 from torchmeso.errors import FormatError
 
 
-def read(path: str | Path) -> Float[Tensor, "H W 3"]:
+def read(path: str | Path | bytes) -> Float[Tensor, "H W 3"]:
     """Return a colour picture as linear RGB; PNG and JPEG are taken as sRGB, EXR as linear.
+
+    Args:
+        path: of the file; or the content of a PNG or JPEG file.
 
     Raises:
         FormatError: the file is missing or unreadable.
     """
-    if Path(path).suffix.lower() == ".exr":
+    if not isinstance(path, bytes) and Path(path).suffix.lower() == ".exr":
         return _read_exr(Path(path))
     return to_linear(torch.from_numpy(_read_pillow(path, "RGB").astype(np.float32) / 255))
 
@@ -37,6 +41,20 @@ def read_data(path: str | Path) -> Float[Tensor, "H W"]:
     if grey.ndim == 3:
         grey = grey[..., 0]
     return torch.from_numpy(grey.astype(np.float32) / (65535 if grey.dtype in (np.uint16, np.int32) else 255))
+
+
+def read_vectors(path: str | Path | bytes) -> Float[Tensor, "H W 3"]:
+    """Return a three-channel picture that holds data, not colour (a normal map), in [0, 1] as stored.
+
+    Args:
+        path: of the file; or the content of a PNG or JPEG file.
+
+    Raises:
+        FormatError: the file is missing or unreadable.
+    """
+    if not isinstance(path, bytes) and Path(path).suffix.lower() == ".exr":
+        return _read_exr(Path(path))
+    return torch.from_numpy(_read_pillow(path, "RGB").astype(np.float32) / 255)
 
 
 def write_png(path: str | Path, rgb: Float[Tensor, "H W 3"]) -> None:
@@ -75,17 +93,18 @@ def to_srgb(linear: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     return torch.where(linear <= 0.0031308, linear * 12.92, 1.055 * linear.clamp(min=0) ** (1 / 2.4) - 0.055)
 
 
-def _read_pillow(path: str | Path, mode: str | None) -> np.ndarray:
+def _read_pillow(path: str | Path | bytes, mode: str | None) -> np.ndarray:
     from PIL import Image, UnidentifiedImageError
 
-    if not Path(path).is_file():
+    name = "embedded picture" if isinstance(path, bytes) else path
+    if not isinstance(path, bytes) and not Path(path).is_file():
         raise FormatError(f"{path}: expected a picture, found none; check the path")
     try:
-        with Image.open(path) as picture:
+        with Image.open(io.BytesIO(path) if isinstance(path, bytes) else path) as picture:
             return np.asarray(picture.convert(mode) if mode else picture)
     except (UnidentifiedImageError, OSError, SyntaxError) as error:
         raise FormatError(
-            f"{path}: expected a PNG, JPEG or EXR picture ({error}); the copy may be incomplete"
+            f"{name}: expected a PNG, JPEG or EXR picture ({error}); the copy may be incomplete"
         ) from error
 
 

@@ -13,10 +13,11 @@ Kernels: kernels_cl/data/pyramid.clh          Test: tests/data/test_pyramid.py
 """
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 MOST_PROBES = 4
@@ -91,6 +92,41 @@ def probes(uv: Float[Tensor, "n 2"], seen: Footprint, texels: int, levels: int) 
             if bool((weight > 0).any()):
                 found.append(Probe(place, which.long().clamp(max=levels - 1), weight))
     return found
+
+
+def average(
+    look_up: Callable[[Bool[Tensor, "n"], Float[Tensor, "m 2"], int], Tensor],
+    uv: Float[Tensor, "*batch 2"],
+    seen: Footprint | None,
+    texels: int,
+    levels: int,
+) -> Tensor:
+    """Return the mean of a texture over what is `seen`, or its value at the point where that is None.
+
+    Args:
+        look_up: returns (m, ...) values of the points `which` at `uv` in a level.
+        uv: (..., 2); (n, 2) where something is seen.
+        seen: what is covered.
+        texels: along the longer side of the texture.
+        levels: of its pyramid.
+
+    Returns:
+        (..., ...) the shape of uv's points, then that of a value.
+    """
+    if seen is None:
+        value = look_up(torch.ones(uv.shape[:-1].numel(), dtype=torch.bool), uv.reshape(-1, 2), 0)
+        return value.reshape(*uv.shape[:-1], *value.shape[1:])
+    total: Tensor | None = None
+    for probe in probes(uv, seen, texels, levels):
+        for level in probe.level.unique().tolist():
+            which = (probe.level == level) & (probe.weight > 0)
+            value = look_up(which, probe.uv[which], level)
+            if total is None:
+                total = value.new_zeros(len(uv), *value.shape[1:])
+            weight = probe.weight[which].reshape(-1, *(1,) * (value.dim() - 1))
+            total[which] = total[which] + weight * value
+    assert total is not None  # weights sum to 1: there is a probe
+    return total
 
 
 def halve(x: Tensor, dim: int) -> Tensor:

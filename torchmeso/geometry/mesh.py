@@ -13,14 +13,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchmeso.errors import FormatError, GeometryError, check_shape
-from torchmeso.geometry import components
+from torchmeso.errors import GeometryError, check_shape
+from torchmeso.geometry import components, mesh_file
 from torchmeso.geometry.directions import dot, normalize
+from torchmeso.geometry.mesh_file import MeshFile
 
 CREASE_DEG = 60.0
 """Faces that meet at a sharper angle (degrees between normals) do not share a vertex normal."""
@@ -68,58 +68,50 @@ class Mesh:
         check_shape("mesh.component", self.component, (len(self.faces),))
 
 
-def load(path: str | Path) -> Mesh:
-    """Return the mesh of a file that trimesh reads (OBJ, PLY, GLB, OFF, STL), dressed.
+def load(path: str | Path, *, uv_set: int = 0) -> Mesh:
+    """Return the mesh of a file (OBJ, glTF, PLY, OFF, STL; see `mesh_file.read`), dressed.
 
     Raises:
         FormatError: the file is missing or unreadable.
         GeometryError: it has no triangles, or no texture coordinates (`unwrap.unwrap` makes some).
     """
-    vertices, faces, uv = read_arrays(path)
-    if uv is None:
-        raise GeometryError(
-            f"{Path(path).name}: expected texture coordinates, got none; "
-            "make some with `unwrap: true` in the configuration (or torchmeso.geometry.unwrap), which cuts seams"
-        )
-    return dress(vertices, faces, uv, name=Path(path).name)
+    return dress_file(mesh_file.read(path, uv_set=uv_set), name=Path(path).name)
 
 
-def read_arrays(path: str | Path) -> tuple[Float[Tensor, "V 3"], Int[Tensor, "F 3"], Float[Tensor, "V 2"] | None]:
-    """Return vertices, faces and texture coordinates (None where the file has none) of a mesh file.
+def dress_file(found: MeshFile, *, tiles: tuple[float, float] = (1.0, 1.0), name: str = "mesh") -> Mesh:
+    """Return the mesh of a file that was read, its texture repeated `tiles` times along u and v.
+
+    Tangent frames that a file gives are kept: normal maps are made for them.
 
     Raises:
-        FormatError: the file is missing or unreadable.
-        GeometryError: it holds no triangles, or coordinates that are not finite.
+        GeometryError: there are no texture coordinates, or none that cover anything.
     """
-    import trimesh
+    if found.uv is None:
+        raise GeometryError(
+            f"{name}: expected texture coordinates, got none; "
+            "make some with `unwrap: true` in the configuration (or torchmeso.geometry.unwrap), which cuts seams"
+        )
+    given = None
+    if found.normals is not None and found.tangents is not None:
+        given = Frames(found.normals, found.tangents[:, :3], found.tangents[:, 3])
+    return dress(found.vertices, found.faces, found.uv * torch.tensor(tiles), given=given, name=name)
 
-    path = Path(path)
-    if not path.is_file():
-        raise FormatError(f"{path}: expected a mesh file, found none; check the path")
-    try:
-        loaded = trimesh.load(path, process=False)
-    except Exception as error:  # trimesh raises whatever its many readers raise
-        raise FormatError(f"{path}: trimesh could not read it ({type(error).__name__}: {error})") from error
-    parts = list(loaded.dump()) if isinstance(loaded, trimesh.Scene) else [loaded]
-    parts = [part for part in parts if isinstance(part, trimesh.Trimesh) and len(part.faces)]
-    if not parts:
-        raise GeometryError(f"{path.name}: expected triangles, got none")
-    uvs = [getattr(part.visual, "uv", None) for part in parts]
-    first = np.cumsum([0, *(len(part.vertices) for part in parts)])
-    vertices = torch.from_numpy(np.concatenate([part.vertices for part in parts]).astype(np.float32))
-    faces = torch.from_numpy(
-        np.concatenate([part.faces + n for part, n in zip(parts, first[:-1], strict=True)]).astype(np.int64)
-    )
-    if not torch.isfinite(vertices).all():
-        raise GeometryError(f"{path.name}: expected finite vertex positions, got NaN or infinity")
-    found = [uv for uv in uvs if uv is not None and len(uv)]
-    if len(found) < len(parts):
-        return vertices, faces, None
-    return vertices, faces, torch.from_numpy(np.concatenate(found).astype(np.float32))
+
+class Frames(NamedTuple):
+    """Tangent frames of vertices as they were given; see `Mesh`."""
+
+    normals: Float[Tensor, "V 3"]
+    tangents: Float[Tensor, "V 3"]
+    sign: Float[Tensor, "V"]
 
 
 def dress(
-    vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], uv: Float[Tensor, "V 2"], *, name: str = "mesh"
+    vertices: Float[Tensor, "V 3"],
+    faces: Int[Tensor, "F 3"],
+    uv: Float[Tensor, "V 2"],
+    *,
+    given: Frames | None = None,
+    name: str = "mesh",
 ) -> Mesh:
     """Return a Mesh: orientation mended, normals, tangents, texture scale and components found.
 
@@ -129,6 +121,7 @@ def dress(
         vertices: (V, 3) world positions; equal positions are one point of the surface.
         faces: (F, 3) vertex numbers; faces without area stay but take no part in the frames.
         uv: (V, 2) in tiles.
+        given: tangent frames to be kept; None = they are found, and vertices split where they jump.
         name: what warnings and errors call the mesh.
 
     Raises:
@@ -148,15 +141,29 @@ def dress(
     _warn_about_anisotropy(name, jacobian, usable)
 
     position = components.weld(vertices)
+    if given is not None:
+        given = _turned(given, faces[flip])
+        scale = _texture_scale(jacobian, usable, faces, _groups(position, given.normals))
+        return Mesh(
+            vertices=vertices,
+            faces=faces,
+            uv=uv,
+            normals=given.normals,
+            tangents=given.tangents,
+            sign=given.sign,
+            scale=scale.to(vertices.dtype),
+            component=found.of_face,
+            closed=found.closed,
+        )
     corner_normal = _corner_normals(vertices, faces, position)
     handed = torch.where(jacobian.uv_area < 0, -1.0, 1.0)
     split = _split(faces, corner_normal, handed)
     source = split.source
     normals = corner_normal.reshape(-1, 3)[split.corner]
-    group = torch.unique(torch.cat([position[source, None].double(), normals.double()], 1), dim=0, return_inverse=True)
-    scale = _texture_scale(jacobian, usable, split.faces, group[1])
+    group = _groups(position[source], normals)
+    scale = _texture_scale(jacobian, usable, split.faces, group)
     sign = handed[split.corner // 3]
-    tangents = _tangents(jacobian, usable, split.faces, normals, 2 * group[1] + (sign < 0))
+    tangents = _tangents(jacobian, usable, split.faces, normals, 2 * group + (sign < 0))
     return Mesh(
         vertices=vertices[source],
         faces=split.faces,
@@ -189,6 +196,19 @@ def transform(mesh: Mesh, matrix: Float[Tensor, "4 4"]) -> Mesh:
         tangents=(mesh.tangents.double() @ rotation.T).to(dtype),
         scale=mesh.scale * size.to(dtype),
     )
+
+
+def _turned(given: Frames, faces: Int[Tensor, "n 3"]) -> Frames:
+    """Return frames that fit the vertices of `faces` that were turned around: n turns, t and b stay."""
+    side = torch.ones_like(given.sign)
+    side[faces.flatten()] = -1
+    return Frames(given.normals * side[:, None], given.tangents, given.sign * side)
+
+
+def _groups(position: Int[Tensor, "V"], normals: Float[Tensor, "V 3"]) -> Int[Tensor, "V"]:
+    """Return a number for each vertex; those at one position with one normal share it."""
+    normal = components.weld(normals)
+    return torch.unique(position * (normal.max() + 1) + normal, return_inverse=True)[1]
 
 
 class _Jacobian(NamedTuple):
@@ -245,21 +265,35 @@ def _corner_normals(vertices: Tensor, faces: Tensor, position: Tensor) -> Tensor
     to_next, to_last = normalize(p.roll(-1, 1) - p), normalize(p.roll(1, 1) - p)
     angle = torch.acos(dot(to_next, to_last).clamp(-1, 1)).flatten()
     around = position[faces].flatten()
-    order = torch.argsort(around, stable=True)
-    count = torch.bincount(around)
-    start = count.cumsum(0) - count
+    facing = face_normal.repeat_interleave(3, 0)
+    size = int(position.max()) + 1
 
+    # Where all faces lie within half the crease angle of their middle, no two of them meet at a crease.
+    middle = normalize(torch.zeros(size, 3, dtype=torch.float64).index_add_(0, around, facing))
+    least = torch.ones(size, dtype=torch.float64)
+    least.scatter_reduce_(0, around, dot(facing, middle[around]), "amin")
+    total = torch.zeros(size, 3, dtype=torch.float64).index_add_(0, around, facing * angle.unsqueeze(-1))
+    normal = total[around]
+    bent = (least < math.cos(math.radians(CREASE_DEG / 2)) + 1e-9)[around].nonzero()[:, 0]
+    normal[bent] = _over_creases(facing[bent], angle[bent], around[bent])
+    lost = normal.norm(dim=-1) < 1e-12  # around faces without area any unit vector will do
+    normal[lost] = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    return normalize(normal).to(vertices.dtype).reshape(-1, 3, 3)
+
+
+def _over_creases(facing: Tensor, angle: Tensor, around: Tensor) -> Tensor:
+    """Return (n, 3) sums of normals at corners whose position is `around`, over those not beyond a crease."""
+    order = torch.argsort(around, stable=True)
+    count = torch.bincount(around, minlength=1)
+    start = count.cumsum(0) - count
     # All pairs of corners at one position: corner i collects the face of corner j.
     pairs = count[around[order]]
     i = order.repeat_interleave(pairs)
     within = torch.arange(len(i)) - (pairs.cumsum(0) - pairs).repeat_interleave(pairs)
     j = order[start[around[i]] + within]
-    near = dot(face_normal[i // 3], face_normal[j // 3]) >= math.cos(math.radians(CREASE_DEG))
-    weighted = face_normal[j // 3] * (angle[j] * near).unsqueeze(-1)
-    normal = torch.zeros(3 * len(faces), 3, dtype=torch.float64).index_add_(0, i, weighted)
-    lost = normal.norm(dim=-1) < 1e-12  # around faces without area any unit vector will do
-    normal[lost] = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-    return normalize(normal).to(vertices.dtype).reshape(-1, 3, 3)
+    near = dot(facing[i], facing[j]) >= math.cos(math.radians(CREASE_DEG))
+    weighted = facing[j] * (angle[j] * near).unsqueeze(-1)
+    return torch.zeros(len(facing), 3, dtype=torch.float64).index_add_(0, i, weighted)
 
 
 class _Split(NamedTuple):
@@ -270,9 +304,9 @@ class _Split(NamedTuple):
 
 def _split(faces: Tensor, corner_normal: Tensor, handed: Tensor) -> _Split:
     """Split vertices so that each has one normal and one handedness."""
-    vertex = faces.flatten()[:, None].double()
-    key = torch.cat([vertex, corner_normal.reshape(-1, 3).double(), handed.repeat_interleave(3)[:, None]], 1)
-    unique, number = torch.unique(key, dim=0, return_inverse=True)
+    normal = components.weld(corner_normal.reshape(-1, 3))
+    key = 2 * (faces.flatten() * (normal.max() + 1) + normal) + (handed < 0).repeat_interleave(3)
+    unique, number = torch.unique(key, return_inverse=True)
     corner = torch.full((len(unique),), 3 * len(faces), dtype=torch.long)
     corner.scatter_reduce_(0, number, torch.arange(3 * len(faces)), "amin")
     return _Split(number.reshape(-1, 3), faces.flatten()[corner], corner)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchmeso.data.height_field import HeightField
 from torchmeso.errors import GeometryError, check_range
-from torchmeso.geometry import mesh
+from torchmeso.geometry import mesh_file
 from torchmeso.transport.materials import Palette
 from torchmeso.transport.tracer import Geometry
 
@@ -98,7 +98,8 @@ def from_file(
         FormatError: the file is missing or unreadable.
         GeometryError: it has no triangles, or is deeper than `h`.
     """
-    vertices, faces, _ = mesh.read_arrays(path)
+    found = mesh_file.read(path)
+    vertices, faces = found.vertices, found.faces
     vertices = vertices - torch.tensor([0.0, 0.0, float(vertices[:, 2].max())])
     depth = max(float(-vertices[:, 2].min()), 1e-6) if h is None else h
     part = torch.zeros(len(faces), dtype=torch.long)

@@ -15,8 +15,9 @@ from pathlib import Path
 
 from torchmeso.compress import eigen
 from torchmeso.config import Config, MaterialConfig, MesoConfig
-from torchmeso.data import btf, eigen_btf, mdf, store
+from torchmeso.data import btf, eigen_btf, mdf, store, textured
 from torchmeso.errors import ConfigError, FormatError
+from torchmeso.geometry.mesh_file import Finish
 from torchmeso.meso import bake_btf, bake_mdf
 from torchmeso.render.scene import Material
 
@@ -54,7 +55,7 @@ def prepare(config: Config, report: Report = silent) -> dict[str, Asset]:
     Raises:
         MesoError: a file is missing, or an option is out of range.
     """
-    used = {item.material for item in config.objects}
+    used = set().union(*(item.used_materials for item in config.objects))
     depth = config.render.silhouette != "none"
     return {
         name: prepare_material(name, m, report, depth=depth) for name, m in config.materials.items() if name in used
@@ -63,8 +64,8 @@ def prepare(config: Config, report: Report = silent) -> dict[str, Asset]:
 
 def prepare_material(name: str, material: MaterialConfig, report: Report = silent, *, depth: bool = True) -> Asset:
     """Return one material, baked and compressed or from the cache; without `depth` its MDF stays on disk."""
-    if material.albedo is not None:
-        return Asset(material=Material(albedo=material.albedo), seconds={}, raw_bytes=0, model_bytes=0)
+    if material.finish is not None:
+        return Asset(material=plain(material.finish), seconds={}, raw_bytes=0, model_bytes=0)
     if material.model is not None:
         opened = open_model(material.model, depth=depth, rank=material.rank)
         return Asset(material=opened, seconds={}, raw_bytes=0, model_bytes=Path(material.model).stat().st_size)
@@ -80,6 +81,17 @@ def prepare_material(name: str, material: MaterialConfig, report: Report = silen
     raw = sum(_size_on_disk(p) for p in table_paths(material))
     opened = open_model(model, depth=depth)
     return Asset(material=opened, seconds=seconds, raw_bytes=raw, model_bytes=model.stat().st_size)
+
+
+def plain(finish: Finish) -> Material:
+    """Return the material of a plain look: a colour, or pictures.
+
+    Raises:
+        FormatError: a picture is missing or unreadable.
+    """
+    if finish.albedo_map is None and finish.normal_map is None:
+        return Material(albedo=finish.albedo)
+    return Material(btf=textured.from_finish(finish), albedo=finish.albedo)
 
 
 def bake_tables(

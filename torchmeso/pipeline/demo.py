@@ -95,6 +95,8 @@ def run(config: Config, out: str | Path, report: Report = silent) -> list[Path]:
 
 def _outline(scene: Scene, owner: Tensor, truth: Tensor) -> tuple[float, float]:
     """Return IoU and outline distance of the pixels that show an object with a mesostructure."""
-    textured = torch.tensor([i for i, o in enumerate(scene.objects) if o.material.mdf is not None], dtype=torch.long)
+    textured = torch.tensor(
+        [i for i, o in enumerate(scene.objects) if any(m.mdf is not None for m in o.materials)], dtype=torch.long
+    )
     a, b = torch.isin(owner, textured), torch.isin(truth, textured)
     return quality.iou(a, b), quality.boundary_distance(a, b)

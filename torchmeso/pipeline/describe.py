@@ -6,10 +6,13 @@ Test: tests/pipeline/test_describe.py
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from torchmeso import config
 from torchmeso.data import btf, image, mdf, store
 from torchmeso.errors import FormatError, human_size
-from torchmeso.geometry import mesh
+from torchmeso.geometry import mesh, mesh_file, unwrap
+from torchmeso.geometry.mesh_file import Group
 
 
 def file(path: str | Path) -> dict[str, Any]:
@@ -96,25 +99,45 @@ def _config(path: Path) -> dict[str, Any]:
         "kind": "configuration",
         "name": settings.name,
         "materials": ", ".join(settings.materials),
-        "objects": ", ".join(f"{o.shape or Path(str(o.mesh)).name} ({o.material})" for o in settings.objects),
+        "objects": ", ".join(map(_object, settings.objects)),
         "lights": ", ".join(light.type for light in settings.lights) or "none",
         "picture": f"{settings.camera.width} x {settings.camera.height}",
         "silhouette": settings.render.silhouette,
     }
 
 
+def _object(item: config.ObjectConfig) -> str:
+    names = ", ".join(sorted(item.used_materials)) or "as its file says"
+    times = f" x {len(item.instances)}" if item.instances else ""
+    return f"{item.shape or Path(str(item.mesh)).name}{times} ({names})"
+
+
 def _mesh(path: Path) -> dict[str, Any]:
-    vertices, faces, uv = mesh.read_arrays(path)
-    about: dict[str, Any] = {"kind": "mesh", "vertices": len(vertices), "triangles": len(faces)}
-    if uv is None:
+    found = mesh_file.read(path)
+    about: dict[str, Any] = {"kind": "mesh", "vertices": len(found.vertices), "triangles": len(found.faces)}
+    if len(found.groups) > 1 or any(group.finish for group in found.groups):
+        about["parts"] = ", ".join(map(_part, found.groups))
+    if found.uv is None:
         return {**about, "texture coordinates": "none; a configuration can make some with unwrap: true"}
-    dressed = mesh.dress(vertices, faces, uv, name=path.name)
+    dressed = mesh.dress_file(found, name=path.name)
+    least, median, most = dressed.scale.quantile(torch.tensor([0.02, 0.5, 0.98])).tolist()
     return {
         **about,
         "components": f"{len(dressed.closed)}, {int(dressed.closed.sum())} closed",
-        "texture scale": f"{float(dressed.scale.median()):.4g} world units per unit of uv",
+        "texture coordinates": f"{found.uv_sets} sets" if found.uv_sets > 1 else "1 set",
+        "texture scale": f"{median:.4g} world units per unit of uv ({least:.3g} to {most:.3g} but for 4 %)",
+        "texture seams": str(unwrap.find_seams(dressed.vertices, dressed.faces, dressed.uv)),
+        "mirrored": f"{float((dressed.sign[dressed.faces[:, 0]] < 0).float().mean()):.0%} of the triangles",
+        "tangents": "from the file" if found.tangents is not None else "found",
         "anisotropy": round(mesh.anisotropy(dressed), 3),
     }
+
+
+def _part(group: Group) -> str:
+    pictures = []
+    if group.finish is not None:
+        pictures = [k for k in ("albedo_map", "normal_map") if getattr(group.finish, k) is not None]
+    return f"{group.name} ({', '.join(pictures)})" if pictures else group.name
 
 
 def _origin(about: dict[str, Any]) -> dict[str, Any]:

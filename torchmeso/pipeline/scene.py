@@ -5,20 +5,59 @@ Test: tests/pipeline/test_scene.py
 
 import warnings
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
+from jaxtyping import Int
+from torch import Tensor
 
 from torchmeso.config import Config, ObjectConfig
-from torchmeso.geometry import mesh, unwrap
+from torchmeso.errors import ConfigError, did_you_mean
+from torchmeso.geometry import mesh, mesh_file, unwrap
 from torchmeso.geometry.mesh import Mesh
-from torchmeso.pipeline.bake import Asset
-from torchmeso.render.scene import Object, Scene
+from torchmeso.geometry.mesh_file import Finish, Group, MeshFile
+from torchmeso.pipeline.bake import Asset, plain
+from torchmeso.render.scene import Material, Object, Scene
+
+
+class Body(NamedTuple):
+    """A mesh, not yet placed, and what its parts look like.
+
+    Attributes:
+        mesh: dressed.
+        part: (F,) row of `looks`; None = all faces have the first.
+        looks: the name of a material of the configuration, or the look that the file gives.
+    """
+
+    mesh: Mesh
+    part: Int[Tensor, "F"] | None
+    looks: tuple[str | Finish, ...]
 
 
 def build(config: Config, assets: dict[str, Asset]) -> Scene:
-    """Return the scene of `config` with its prepared materials."""
+    """Return the scene of `config` with its prepared materials; an object for each place of each body.
+
+    Raises:
+        MesoError: a mesh or a picture is missing or unreadable, or a part of a mesh has no material.
+    """
+    found: dict[Finish, Material] = {}
+
+    def material(look: str | Finish) -> Material:
+        if isinstance(look, str):
+            return assets[look].material
+        if look not in found:
+            found[look] = plain(look)
+        return found[look]
+
+    objects = []
+    for item, body in zip(config.objects, read_bodies(config), strict=True):
+        first, *others = (material(look) for look in body.looks)
+        objects += [
+            Object(mesh=mesh.transform(body.mesh, matrix), material=first, others=tuple(others), part=body.part)
+            for matrix in item.places()
+        ]
     return Scene(
-        objects=tuple(Object(mesh=build_mesh(o), material=assets[o.material].material) for o in config.objects),
+        objects=tuple(objects),
         lights=tuple(light.build() for light in config.lights),
         ambient=config.ambient,
         ambient_rule=config.ambient_rule,
@@ -28,30 +67,88 @@ def build(config: Config, assets: dict[str, Asset]) -> Scene:
 
 def bare(scene: Scene) -> Scene:
     """Return the scene without its MDFs: what a BTF alone can show."""
-    return replace(scene, objects=tuple(replace(o, material=replace(o.material, mdf=None)) for o in scene.objects))
+    return replace(
+        scene,
+        objects=tuple(
+            replace(o, material=replace(o.material, mdf=None), others=tuple(replace(m, mdf=None) for m in o.others))
+            for o in scene.objects
+        ),
+    )
+
+
+def read_bodies(config: Config) -> list[Body]:
+    """Return the body of each object of `config`; those that ask for the same are read once.
+
+    Raises:
+        MesoError: a file is missing or unreadable, has no texture coordinates, or a part has no material.
+    """
+    kept: dict[str, Body] = {}
+    bodies = []
+    for item in config.objects:
+        key = item.model_dump_json(exclude={"scale", "rotate_deg", "translate", "instances"})
+        if key not in kept:
+            kept[key] = read_body(item)
+        bodies.append(kept[key])
+    return bodies
+
+
+def read_body(item: ObjectConfig) -> Body:
+    """Return the mesh of an object, not yet placed, and what its parts look like.
+
+    Raises:
+        MesoError: the file is missing or unreadable, has no texture coordinates, or a part has no material.
+    """
+    if item.shape is not None:
+        assert item.material is not None
+        return Body(item.build_shape(), None, (item.material,))
+    assert item.mesh is not None
+    found = mesh_file.read(item.mesh, uv_set=item.uv_set)
+    looks = _looks(item, found.groups)
+    if item.unwrap:
+        found = _unwrapped(item, found)
+    dressed = mesh.dress_file(found, tiles=item.tiles_pair, name=item.mesh)
+    kinds = list(dict.fromkeys(looks))
+    part = torch.tensor([kinds.index(look) for look in looks])[found.part]
+    return Body(dressed, part if len(kinds) > 1 else None, tuple(kinds))
 
 
 def build_mesh(item: ObjectConfig) -> Mesh:
     """Return the mesh of an object where it stands.
 
     Raises:
-        MesoError: the file is missing or unreadable, has no texture coordinates, or an option is out of range.
+        MesoError: as `read_body`.
     """
-    if item.shape is not None:
-        return mesh.transform(item.build_shape(), item.matrix())
-    assert item.mesh is not None
-    vertices, faces, uv = mesh.read_arrays(item.mesh)
-    if item.unwrap:
-        assert item.tile_size is not None
-        atlas = unwrap.unwrap(vertices, faces, tile_size=item.tile_size)
-        share = atlas.seam_length / max(atlas.edge_length, 1e-30)
-        warnings.warn(
-            f"{item.mesh}: unwrapped; texture seams are {atlas.seam_length:.3g} world units long "
-            f"({share:.0%} of all edges), the mesostructure does not continue across them",
-            stacklevel=2,
-        )
-        vertices, faces, uv = atlas.vertices, atlas.faces, atlas.uv
-    if uv is None:
-        return mesh.load(item.mesh)  # says what is missing and what to do
-    uv = uv * torch.tensor(item.tiles_pair)
-    return mesh.transform(mesh.dress(vertices, faces, uv, name=item.mesh), item.matrix())
+    return mesh.transform(read_body(item).mesh, item.places()[0])
+
+
+def _looks(item: ObjectConfig, groups: tuple[Group, ...]) -> list[str | Finish]:
+    """Return what each part of a mesh looks like: as named, else the object's material, else as its file says."""
+    names = [group.name for group in groups]
+    for name in item.materials:
+        if name not in names:
+            raise ConfigError(f"objects.materials: {item.mesh} has no part '{name}'{did_you_mean(name, names)}")
+    looks: list[str | Finish] = []
+    for name, finish in groups:
+        look = item.materials.get(name, item.material) or finish
+        if look is None:
+            raise ConfigError(
+                f"objects: {item.mesh}: expected a material for the part '{name}', got none; "
+                "name one in 'materials', or one for all parts in 'material'"
+            )
+        looks.append(look)
+    return looks
+
+
+def _unwrapped(item: ObjectConfig, found: MeshFile) -> MeshFile:
+    """Return a mesh with an atlas in place of its texture coordinates, and say how much it cuts."""
+    assert item.tile_size is not None
+    options = item.unwrap if isinstance(item.unwrap, unwrap.UnwrapOptions) else None
+    atlas = unwrap.unwrap(found.vertices, found.faces, tile_size=item.tile_size, options=options)
+    warnings.warn(
+        f"{item.mesh}: unwrapped into {atlas.charts} charts; texture seams are {atlas.seams}, "
+        "the mesostructure does not continue across them",
+        stacklevel=2,
+    )
+    return replace(
+        found, vertices=atlas.vertices, faces=atlas.faces, uv=atlas.uv, normals=None, tangents=None, uv_sets=1
+    )

@@ -6,21 +6,27 @@ through each pixel's centre, because that is what the product samples; the ambie
 Test: tests/pipeline/test_truth.py
 """
 
-from dataclasses import dataclass
+import hashlib
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchmeso.config import Config, MaterialConfig
-from torchmeso.data import store
+from torchmeso.config import Config, MaterialConfig, ObjectConfig
+from torchmeso.data import store, textured
 from torchmeso.errors import ConfigError
 from torchmeso.geometry.camera import Camera
 from torchmeso.geometry.light import Light, illuminate
+from torchmeso.geometry.mesh import Mesh
+from torchmeso.geometry.mesh_file import Finish, Picture
 from torchmeso.meso.displace import displace
-from torchmeso.meso.mesostructure import palette
+from torchmeso.meso.mesostructure import Mesostructure, palette
 from torchmeso.pipeline.bake import Report, code_hash, describe_meso, file_hash, silent
-from torchmeso.pipeline.scene import build_mesh
+from torchmeso.pipeline.scene import Body, read_bodies, read_body
 from torchmeso.transport.path import radiance
 from torchmeso.transport.tracer import Geometry, MeshTracer
 
@@ -58,40 +64,72 @@ def render(config: Config, report: Report = silent) -> Truth:
         kept = store.Model(path)
         return Truth(rgb=kept.read("rgb"), depth=kept.read("depth"), owner=kept.read("owner"))
     report("truth: displaced mesh", 0)
-    tracer = MeshTracer(*geometries(config))
+    objects, parts = zip(*_surfaces(config), strict=True)
+    tracer = MeshTracer(*parts)
     report("truth: displaced mesh", 1)
     camera, lights = config.camera.build(), [light.build() for light in config.lights]
     found = _trace(config, tracer, camera, lights, report)
+    found = replace(found, owner=torch.tensor([*objects, -1])[found.owner])
     path.parent.mkdir(parents=True, exist_ok=True)
     store.write_model(path, {"rgb": found.rgb, "depth": found.depth, "owner": found.owner}, {"kind": "truth"})
     return found
 
 
 def geometries(config: Config) -> list[Geometry]:
-    """Return the triangles of every object: displaced where it has a mesostructure, plain else."""
+    """Return the triangles of every object, one for each of its materials: displaced, or plain with its colours."""
+    return [geometry for _, geometry in _surfaces(config)]
+
+
+def _surfaces(config: Config) -> Iterator[tuple[int, Geometry]]:
+    """Yield geometries with the number of the object that each belongs to, as `pipeline.scene` counts them."""
     mesos = {name: m.meso.build() for name, m in config.materials.items() if m.meso is not None}
-    result = []
-    for item in config.objects:
-        body, material = build_mesh(item), config.materials[item.material]
-        if material.model is not None:
-            raise ConfigError(
-                f"truth: expected the mesostructure of '{item.material}', got a finished model; "
-                "name its source with 'meso' to compare with the truth"
-            )
-        if material.meso is None:
-            assert material.albedo is not None
-            part = torch.zeros(len(body.faces), dtype=torch.long)
-            colour = palette((material.albedo, 1.0, 0.0))
-            result.append(Geometry(vertices=body.vertices, faces=body.faces, part=part, palette=colour))
-        else:
-            result.append(displace(body, mesos[item.material], max_edge=config.truth.max_edge))
-    return result
+    first = 0
+    for item, body in zip(config.objects, read_bodies(config), strict=True):
+        places = item.places()
+        # A similarity carries displaced triangles as it carries the mesh: each body is displaced once.
+        for k, look in enumerate(body.looks):
+            geometry = _geometry(config, mesos, _only(body, k), look)
+            for i, matrix in enumerate(places):
+                vertices = geometry.vertices.double() @ matrix[:3, :3].double().T + matrix[:3, 3].double()
+                yield first + i, replace(geometry, vertices=vertices.float())
+        first += len(places)
+
+
+def _only(body: Body, k: int) -> Mesh:
+    """Return the faces of a body that have its look `k`."""
+    if body.part is None:
+        return body.mesh
+    mine = body.part == k
+    return replace(body.mesh, faces=body.mesh.faces[mine], component=body.mesh.component[mine])
+
+
+def _geometry(config: Config, mesos: dict[str, Mesostructure], body: Mesh, look: str | Finish) -> Geometry:
+    material = config.materials[look] if isinstance(look, str) else None
+    finish = look if isinstance(look, Finish) else config.materials[look].finish
+    if material is not None and material.meso is not None:
+        return displace(body, mesos[str(look)], max_edge=config.truth.max_edge)
+    if finish is None:
+        raise ConfigError(
+            f"truth: expected the mesostructure of '{look}', got a finished model; "
+            "name its source with 'meso' to compare with the truth"
+        )
+    if finish.normal_map is not None:
+        warnings.warn("truth: a normal map has no geometry; it is left out", stacklevel=2)
+    colours = textured.from_finish(replace(finish, normal_map=None))
+    return Geometry(
+        vertices=body.vertices,
+        faces=body.faces,
+        part=torch.zeros(len(body.faces), dtype=torch.long),
+        palette=palette(((1.0, 1.0, 1.0), 1.0, 0.0)),
+        albedo_map=colours.albedo,
+        uv=body.uv,
+    )
 
 
 def first_hits(
     tracer: MeshTracer, camera: Camera
 ) -> tuple[Int[Tensor, "H W"], Float[Tensor, "H W"], Float[Tensor, "pixel 3"], Float[Tensor, "pixel 3"]]:
-    """Return for each pixel the object hit (-1 = none), the distance, and all ray origins and directions."""
+    """Return for each pixel the geometry hit (-1 = none), the distance, and all ray origins and directions."""
     origin, direction, _ = camera.rays(camera.pixel_centres().reshape(-1, 2))
     hits, owner = tracer.first_hits(origin, direction)
     size = (camera.height, camera.width)
@@ -131,11 +169,29 @@ def _trace(config: Config, tracer: MeshTracer, camera: Camera, lights: list[Ligh
 
 
 def _key(config: Config) -> str:
-    used = {o.material: config.materials[o.material] for o in config.objects}
-    meshes = [file_hash(o.mesh) if o.mesh else None for o in config.objects]
+    used = {name: config.materials[name] for o in config.objects for name in o.used_materials}
+    meshes = [[file_hash(o.mesh), _own_looks(o)] if o.mesh else None for o in config.objects]
     about = config.model_dump(include={"objects", "lights", "ambient", "background", "camera", "truth"})
     return store.content_hash(about, meshes, {n: _describe(m) for n, m in used.items()}, code_hash(CODE))
 
 
+def _own_looks(item: ObjectConfig) -> list:
+    """Return the looks that a mesh's file gives it, its pictures by content, for a content hash."""
+    if item.material is not None:
+        return []
+    looks = [look for look in read_body(item).looks if isinstance(look, Finish)]
+    return [
+        [look.albedo, *(p if p is None else _picture_hash(p) for p in (look.albedo_map, look.normal_map))]
+        for look in looks
+    ]
+
+
+def _picture_hash(picture: Picture) -> str:
+    return file_hash(picture) if isinstance(picture, Path) else hashlib.sha256(picture).hexdigest()
+
+
 def _describe(material: MaterialConfig) -> object:
-    return material.albedo if material.meso is None else describe_meso(material.meso)
+    if material.meso is not None:
+        return describe_meso(material.meso)
+    pictures = [file_hash(p) for p in (material.albedo_map, material.normal_map) if p is not None]
+    return [material.albedo, *pictures]

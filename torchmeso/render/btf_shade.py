@@ -57,14 +57,14 @@ def shade(
 def _per_material(scene: Scene, points: Points, wi: Tensor | None, wo: Tensor, samples: int | None) -> Tensor:
     """Return T, or L_a where `wi` is None; a low-rank model's negative values become 0."""
     result = torch.zeros_like(points.position)
-    for i, item in enumerate(scene.objects):
+    for i, material in enumerate(scene.surfaces):
         mine = (points.owner == i).nonzero()[:, 0]
         if len(mine):
             from_light = None if wi is None else wi[mine]
             seen = None
             if samples is not None:
                 seen = footprint(wo[mine], points.pixel[mine] / (points.scale[mine] * samples))
-            result[mine] = _reflect(item.material, points.uv[mine], from_light, wo[mine], seen)
+            result[mine] = _reflect(material, points.uv[mine], from_light, wo[mine], seen)
     return result.clamp(min=0)
 
 

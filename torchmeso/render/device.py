@@ -20,6 +20,7 @@ from torchmeso.backends import opencl
 from torchmeso.data.eigen_btf import EigenBtf
 from torchmeso.data.mdf import Mdf
 from torchmeso.data.relief import CODES as RELIEF_CODES
+from torchmeso.data.textured import Textured
 from torchmeso.errors import BackendError
 from torchmeso.geometry import hemisphere
 from torchmeso.geometry.directions import normalize
@@ -39,14 +40,19 @@ FACET = np.dtype(
     + [(name, "f4") for name in ("turn", "scale")]
     + [("normal", "f4", 3), ("corner", "i4", 3), ("first", "f4", 3), ("second", "f4", 3)]
 )
-"""A face as kernels read it, in one line of the cache; see `Facet` in kernels_cl/render/scene.clh."""
+"""A face as kernels read it, in one line of the cache; see `Facet` in kernels_cl/render/scene.clh. What kernels call an
+object is a surface here (`Scene.surfaces`): an object in one of its materials."""
 
 REFLECTANCE = np.dtype(
     [(name, "i4") for name in ("there", "height", "width", "groups", "codes", "light_rings", "light_count")]
     + [(name, "i4") for name in ("view_rings", "view_count", "maps", "weights", "scale", "offset", "ambient")]
     + [(name, "i4") for name in ("ambient_scale", "ambient_offset", "levels", "level_count")]
-    + [("last_cosine", "f4"), ("albedo", "f4", 3), ("pad", "i4", 10)]
+    + [("last_cosine", "f4"), ("albedo", "f4", 3)]
+    + [(name, "i4") for name in ("normals", "normal_levels", "normal_level_count")]
+    + [("pad", "i4", 7)]
 )
+EIGEN, TEXTURED = 1, 2
+"""What stands in a reflectance's `there`; 0 = a plain colour."""
 
 MDF = np.dtype(
     [(name, "i4") for name in ("there", "height", "width", "rings", "ring_count", "delta", "missing")]
@@ -73,6 +79,8 @@ ADDRESSES = {
         "ambient_scale",
         "ambient_offset",
         "levels",
+        "normals",
+        "normal_levels",
     ),
     MDF: ("rings", "delta", "missing", "relief", "plateau", "hole"),
 }
@@ -98,9 +106,9 @@ class DeviceMaterials(NamedTuple):
 
     Attributes:
         tables: everything that is looked up.
-        mdfs: (object,) see `MDF`.
-        reflectances: (object,) see `REFLECTANCE`.
-        textured: whether any object has a mesostructure.
+        mdfs: (surface,) see `MDF`.
+        reflectances: (surface,) see `REFLECTANCE`.
+        textured: whether any surface has a mesostructure.
         parts: the BTFs and MDFs in `tables`, by identity.
         packed: how many of them were uploaded, not taken over.
     """
@@ -128,21 +136,21 @@ def upload_geometry(world: World) -> DeviceGeometry:
     Raises:
         BackendError: there is no device.
     """
-    tags = torch.stack([(world.component << 2) | (world.closed[world.component].long() << 1), world.owner], 1)
+    tag = (world.component << 2) | (world.closed[world.component].long() << 1)
     return DeviceGeometry(
-        upload_mesh(world.vertices, world.faces, tags),
+        upload_mesh(world.vertices, world.faces, torch.stack([tag, world.object[world.owner]], 1)),
         opencl.upload(vertex_records(world)),
-        opencl.upload(face_records(world, tags)),
+        opencl.upload(face_records(world, torch.stack([tag, world.owner], 1))),
     )
 
 
 def upload_materials(
     materials: Sequence[Material], *, silhouettes: bool, ambient: bool, before: DeviceMaterials | None = None
 ) -> DeviceMaterials:
-    """Return the materials of a scene's objects on the device.
+    """Return the materials of a scene's surfaces on the device.
 
     Args:
-        materials: of each object.
+        materials: of each surface.
         silhouettes: whether the mesostructure has depth; without, MDFs are not read.
         ambient: whether the ambient term is needed.
         before: what stands on the device already; BTFs and MDFs that are the same objects are taken over from there.
@@ -150,7 +158,7 @@ def upload_materials(
     Raises:
         BackendError: there is no device, or a material is of a kind that kernels do not read.
     """
-    wanted: dict[tuple[int, bool], EigenBtf | Mdf] = {}
+    wanted: dict[tuple[int, bool], EigenBtf | Textured | Mdf] = {}
     for m in materials:
         if m.btf is not None:
             wanted[id(m.btf), ambient] = _readable(m.btf)
@@ -175,7 +183,9 @@ def upload_materials(
 
 
 def _join(
-    kept: "dict[tuple[int, bool], _Part]", new: "dict[tuple[int, bool], EigenBtf | Mdf]", before: DeviceMaterials | None
+    kept: "dict[tuple[int, bool], _Part]",
+    new: "dict[tuple[int, bool], EigenBtf | Textured | Mdf]",
+    before: DeviceMaterials | None,
 ) -> "tuple[opencl.Buffer, dict[tuple[int, bool], _Part]]":
     """Return a buffer with the parts that are `kept`, copied on the device, and behind them the `new` ones."""
     parts, copies, blocks = {}, [], 0
@@ -186,7 +196,10 @@ def _join(
     arrays = []
     for key, source in new.items():
         pool = _Pool()
-        record = _reflectance(pool, source, ambient=key[1]) if isinstance(source, EigenBtf) else _mdf(pool, source)
+        if isinstance(source, EigenBtf):
+            record = _reflectance(pool, source, ambient=key[1])
+        else:
+            record = _pictures(pool, source) if isinstance(source, Textured) else _mdf(pool, source)
         arrays.append(pool.joined())
         parts[key] = _Part(source, blocks, len(arrays[-1]) // BLOCK, record)
         blocks += parts[key].blocks
@@ -217,7 +230,7 @@ def vertex_records(world: World) -> Float[np.ndarray, "V 16"]:
 
 
 def face_records(world: World, tags: Int[Tensor, "F 2"]) -> np.ndarray:
-    """Return what is asked of each face, see `FACET`; `tags` are those of `upload_mesh`."""
+    """Return what is asked of each face, see `FACET`; `tags` are as those of `upload_mesh`, of surfaces."""
     p, n = world.vertices.double()[world.faces], normalize(world.normals.double())[world.faces]
     e1, e2 = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
     normal = normalize(torch.linalg.cross(e1, e2))
@@ -247,8 +260,8 @@ def light_records(lights: tuple[Light, ...]) -> np.ndarray:
     return records
 
 
-def _readable(btf: object) -> EigenBtf:
-    if not isinstance(btf, EigenBtf):
+def _readable(btf: object) -> EigenBtf | Textured:
+    if not isinstance(btf, EigenBtf | Textured):
         raise BackendError(f"opencl: expected an eigen BTF, got {type(btf).__name__}; use the torch backend")
     return btf
 
@@ -270,7 +283,7 @@ def _reflectance(pool: "_Pool", btf: EigenBtf, *, ambient: bool) -> np.ndarray:
     scale, offset = _grouped(btf.scale.float()[None])[0], _grouped(btf.offset.float()[None])[0]
     by_channel = _grouped(weights[:, :, None].expand(-1, -1, 3))
     by_channel[:, :, 3] = _bounds(btf, weights)
-    record["there"], record["height"], record["width"], record["groups"] = 1, height, width, groups
+    record["there"], record["height"], record["width"], record["groups"] = EIGEN, height, width, groups
     record["codes"] = codes
     record["light_rings"], record["light_count"] = pool.add(_rings(btf.lights)), _ring_count(btf.lights)
     record["view_rings"], record["view_count"] = pool.add(_rings(btf.views)), _ring_count(btf.views)
@@ -304,6 +317,25 @@ def _level_records(btf: EigenBtf, rows: list[int]) -> Int32[np.ndarray, "level 4
     first = groups * np.cumsum([0, *rows[:-1]])
     ambient = groups * np.cumsum([0, *(h * w for h, w in sizes[:-1])])
     return np.stack([first, ambient, *np.array(sizes).T], 1).astype(np.int32)
+
+
+def _pictures(pool: "_Pool", looks: Textured) -> np.ndarray:
+    record = np.zeros(1, REFLECTANCE)
+    record["there"], record["normals"] = TEXTURED, -1
+    record["maps"], record["levels"], record["level_count"] = _levels_of_four(pool, looks.albedo_levels)
+    if looks.normal_levels is not None:
+        found = _levels_of_four(pool, looks.normal_levels)
+        record["normals"], record["normal_levels"], record["normal_level_count"] = found
+    return record
+
+
+def _levels_of_four(pool: "_Pool", levels: list[Float[Tensor, "H W 3"]]) -> tuple[int, int, int]:
+    """Return where a pyramid's pictures begin, one behind the other, and where their sizes stand; and their number."""
+    sizes = [tuple(x.shape[:2]) for x in levels]
+    first = np.cumsum([0, *(h * w for h, w in sizes[:-1])])
+    pixels = torch.cat([x.flatten(0, 1) for x in levels]).float()
+    records = np.stack([first, first, *np.array(sizes).T], 1).astype(np.int32)
+    return pool.add(torch.nn.functional.pad(pixels, (0, 1)).numpy()), pool.add(records), len(levels)
 
 
 def _bounds(btf: EigenBtf, weights: Float[Tensor, "view rank"]) -> Float[Tensor, "view group"]:

@@ -147,7 +147,7 @@ def _develop(
     outside = seen.fragment >= 0
     pixel, fragment = seen.pixel[outside], seen.fragment[outside]
     points = interpolate(world, layers, camera, fragment)
-    owner[pixel] = points.owner
+    owner[pixel] = world.object[points.owner]
     origin, direction, _ = rays(camera, pixel, dtype)
     receiver = origin + seen.depth[outside, None] * direction
     dark = torch.zeros(len(scene.lights), len(pixel), dtype=torch.bool)

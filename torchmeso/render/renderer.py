@@ -96,7 +96,8 @@ class Renderer:
         """Compile in what this scene needs."""
         textured = self._on_device.materials.textured or not self._skips.plain
         mode = {"none": 0, "paper": 1, "curved": 2}[self.options.silhouette] if textured else 0
-        self._defines = (f"-DSILHOUETTE={mode}", *(["-DONE_LAYER"] * self._one_layer))
+        mixed = mode != 0 and self._on_device.mixed
+        self._defines = (f"-DSILHOUETTE={mode}", *(["-DONE_LAYER"] * self._one_layer), *(["-DMIXED"] * mixed))
         self._plain = mode == 0 and self.options.silhouette != "none"
         self._cull = mode == 0 and self._skips.hidden  # where no surface has depth, faces turned away hide nothing
 
@@ -123,7 +124,7 @@ class Renderer:
         picture = self._frame(camera, lights, DETAILS)
         seconds = {"frame": time.perf_counter() - start, **self._seconds}
         self._seconds = {}
-        return picture.finished(camera, self.counts, seconds)
+        return picture.finished(camera, self._on_device.object_of, self.counts, seconds)
 
     def show(self, camera: Camera, lights: tuple[Light, ...] | None = None) -> UInt8[Tensor, "height width 4"]:
         """Return what a screen shows of the picture: sRGB of 8 bits, and 255 where an object is seen.
@@ -354,6 +355,12 @@ class _OnDevice(NamedTuple):
     geometry: device.DeviceGeometry
     materials: device.DeviceMaterials
     corners: Float[np.ndarray, "3 V"]  # see `shadow_map.cameras`
+    object_of: list[int]  # of each surface
+
+    @property
+    def mixed(self) -> bool:
+        """Return whether an interval can have different mesostructures at its ends."""
+        return any(len({id(m.mdf) for m in o.materials}) > 1 for o in self.scene.objects)
 
     def since(self, before: "_OnDevice | None") -> dict[str, int]:
         """Return what was uploaded that was not there before."""
@@ -364,15 +371,17 @@ class _OnDevice(NamedTuple):
 def _upload(scene: Scene, options: FrameOptions, before: _OnDevice | None = None) -> _OnDevice:
     """Return `scene` on the device, with what it shares with the one before."""
     materials = device.upload_materials(
-        [o.material for o in scene.objects],
+        scene.surfaces,
         silhouettes=options.silhouette != "none",
         ambient=scene.ambient > 0,
         before=None if before is None else before.materials,
     )
-    if before is not None and _are(_meshes(scene), _meshes(before.scene)):
+    object_of = [i for i, o in enumerate(scene.objects) for _ in o.materials]
+    same = before is not None and _are(_meshes(scene), _meshes(before.scene)) and object_of == before.object_of
+    if before is not None and same:
         return before._replace(scene=scene, materials=materials)
     world = assemble(scene)
-    return _OnDevice(scene, device.upload_geometry(world), materials, shadow_map.corners_of(world))
+    return _OnDevice(scene, device.upload_geometry(world), materials, shadow_map.corners_of(world), object_of)
 
 
 @dataclass(eq=False, kw_only=True)
@@ -408,8 +417,10 @@ class _Picture:
     shone: tuple[Light, ...] | None = None
     lit: tuple[int, list[int]] = (0, [])
 
-    def finished(self, camera: Camera, counts: dict[str, int], seconds: dict[str, float]) -> Picture:
-        """Return the frame just drawn."""
+    def finished(
+        self, camera: Camera, object_of: list[int], counts: dict[str, int], seconds: dict[str, float]
+    ) -> Picture:
+        """Return the frame just drawn; kernels count surfaces, `object_of` says whose they are."""
         height, width = camera.height, camera.width
         count, reaching = self.lit
         shadowed = torch.zeros(count, height, width, dtype=torch.bool)
@@ -417,7 +428,7 @@ class _Picture:
         return Picture(
             rgb=self.rgba[:height, :width, :3],
             depth=self.depth[:height, :width],
-            owner=self.owner[:height, :width].long(),
+            owner=torch.tensor([*object_of, -2, -1])[self.owner[:height, :width].long()],
             shadowed=shadowed,
             counts=counts,
             seconds=seconds,
@@ -425,11 +436,11 @@ class _Picture:
 
 
 def _meshes(scene: Scene) -> list[object]:
-    return [o.mesh for o in scene.objects]
+    return [x for o in scene.objects for x in (o.mesh, o.part)]
 
 
 def _depths(scene: Scene) -> list[object]:
-    return [o.material.mdf for o in scene.objects]
+    return [m.mdf for m in scene.surfaces]
 
 
 def _are(a: list[object], b: list[object]) -> bool:

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchmeso.data.btf import Evaluable
-from torchmeso.errors import ConfigError, check_shape
+from torchmeso.errors import ConfigError, check_range, check_shape
 from torchmeso.geometry import frames
 from torchmeso.geometry.camera import Camera
 from torchmeso.geometry.frames import Frame
@@ -65,10 +65,36 @@ class Material:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Object:
-    """A mesh with a material."""
+    """A mesh with a material, or with one for each part of it.
+
+    A body of several materials stays one mesh: whether it is closed, and where a ray is inside of it, is asked of the
+    whole.
+
+    Attributes:
+        mesh: where it stands.
+        material: of all faces, or of those whose `part` is 0.
+        others: of faces whose `part` is 1, 2, ...
+        part: (F,) which of `materials` each face has; None = all have the first.
+    """
 
     mesh: Mesh
     material: Material
+    others: tuple[Material, ...] = ()
+    part: Int[Tensor, "F"] | None = None
+
+    def __post_init__(self) -> None:
+        """Raise ShapeError or ConfigError unless every face has a material that is there."""
+        if self.part is None:
+            return
+        check_shape("object.part", self.part, (len(self.mesh.faces),))
+        if len(self.part):
+            check_range("object.part", float(self.part.min()), 0, len(self.others))
+            check_range("object.part", float(self.part.max()), 0, len(self.others))
+
+    @property
+    def materials(self) -> tuple[Material, ...]:
+        """All materials, as `part` counts them."""
+        return (self.material, *self.others)
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -96,6 +122,11 @@ class Scene:
             raise ConfigError("scene: expected at least one object, got none")
         if self.ambient_rule not in ("add", "paper"):
             raise ConfigError(f"scene.ambient_rule: expected 'add' or 'paper', got '{self.ambient_rule}'")
+
+    @property
+    def surfaces(self) -> tuple[Material, ...]:
+        """The materials of all objects, one behind the other: what `World.owner` counts."""
+        return tuple(m for o in self.objects for m in o.materials)
 
 
 def in_double(scene: Scene) -> Scene:
@@ -129,7 +160,8 @@ class World(NamedTuple):
         scale: (V,) texture scale.
         component: (F,) component, numbered through all objects.
         closed: (C,) whether a component is closed.
-        owner: (F,) object each face belongs to.
+        owner: (F,) surface each face belongs to: its object's material, see `Scene.surfaces`.
+        object: (surface,) object each surface belongs to.
     """
 
     vertices: Float[Tensor, "V 3"]
@@ -142,6 +174,7 @@ class World(NamedTuple):
     component: Int[Tensor, "F"]
     closed: Bool[Tensor, "C"]
     owner: Int[Tensor, "F"]
+    object: Int[Tensor, "surface"]
 
 
 class Points(NamedTuple):
@@ -152,7 +185,7 @@ class Points(NamedTuple):
         uv: (n, 2).
         frame: world tangent frame; each vector (n, 3).
         scale: (n,) texture scale.
-        owner: (n,) object.
+        owner: (n,) surface, see `Scene.surfaces`.
         pixel: (n,) world width of a pixel there.
     """
 
@@ -179,14 +212,18 @@ def assemble(scene: Scene) -> World:
         component.append(m.component + first_component)
         first_vertex += len(m.vertices)
         first_component += len(m.closed)
-    owner = torch.cat([torch.full((len(m.faces),), i) for i, m in enumerate(meshes)])
+    owner, objects = [], []
+    for i, o in enumerate(scene.objects):
+        part = torch.zeros(len(o.mesh.faces), dtype=torch.long) if o.part is None else o.part.long()
+        owner.append(part + len(objects))
+        objects += [i] * len(o.materials)
 
     def join(name: str) -> Tensor:
         return torch.cat([getattr(m, name) for m in meshes])
 
     return World(
         join("vertices"), torch.cat(faces), join("uv"), join("normals"), join("tangents"), join("sign"), join("scale"),
-        torch.cat(component), join("closed"), owner,
+        torch.cat(component), join("closed"), torch.cat(owner), torch.tensor(objects),
     )  # fmt: skip
 
 

@@ -109,7 +109,7 @@ def _draw(scene: Scene, world: World, camera: Camera, silhouette: Silhouette) ->
 
     # Closed: a little before the back, so that the far side of a body is in its own shadow, but not before the middle.
     inside = -torch.minimum(bias, (t - candidates.t) / 2)
-    slabs = [0.0 if o.material.mdf is None else o.material.mdf.h for o in scene.objects]
+    slabs = [0.0 if m.mdf is None else m.mdf.h for m in scene.surfaces]
     h = torch.tensor(slabs, dtype=t.dtype)[points.owner]
     textured = layers.triangles.front[layers.triangle[surface]] & (silhouette != "none")
     slab = torch.where(textured, points.scale * h / cosine.clamp(min=MIN_COS), 0)

@@ -166,7 +166,7 @@ def _opaque(
     scene: Scene, world: World, layers: Layers, found: Intervals, single: Tensor, silhouette: Silhouette
 ) -> tuple[Intervals, Tensor]:
     """Take bodies whose surface has no depth as opaque: every front face stops a ray, whatever is behind it."""
-    plain = torch.tensor([silhouette == "none" or o.material.mdf is None for o in scene.objects])
+    plain = torch.tensor([silhouette == "none" or m.mdf is None for m in scene.surfaces])
     face = layers.triangles.face[layers.triangle]
     closed = world.closed[world.component[face]]
     front = layers.triangles.front[layers.triangle]
@@ -224,6 +224,7 @@ def _test_paper(ends: _Ends) -> _Verdict:
     thin_back = thin[backs].nonzero()[:, 0]
     d_back[backs[thin_back]] = back.select(thin_back).depth(closely=torch.ones(len(thin_back), dtype=torch.bool))
     hit = (d_front + d_back <= ends.t_back - ends.t_front) | ~has_front  # the eye inside sees the inside
+    hit |= _relief(ends.scene)[_owner(ends, ends.found.front)] < 0  # without depth a surface is opaque
     return _Verdict(hit, d_front, int((~thin).sum()))
 
 
@@ -234,15 +235,15 @@ def _test_curved(ends: _Ends) -> _Verdict:
     hit, d_front = torch.ones_like(whole), torch.zeros_like(ends.t_front)
     length = ends.t_back - ends.t_front
     fronts = (found.front >= 0).nonzero()[:, 0]
-    owner = torch.full_like(found.front, -1)
-    owner[fronts] = ends.world.owner[ends.layers.triangles.face[ends.layers.triangle[found.front[fronts]]]]
+    owner = _owner(ends, found.front)
     if ends.depths:
         d_front[fronts] = _look(ends, found.front[fronts], towards=True).depth()
         d_front = torch.minimum(d_front, length)
     deep = torch.zeros_like(whole)
-    for i, item in enumerate(ends.scene.objects):
-        mdf = item.material.mdf
-        mine = (whole & (owner == i)).nonzero()[:, 0]
+    relief = _relief(ends.scene)
+    mixed = whole & (relief[_owner(ends, found.back)] != relief[owner])
+    for i, mdf in enumerate(m.mdf for m in ends.scene.surfaces):
+        mine = (whole & ~mixed & (owner == i)).nonzero()[:, 0]
         if mdf is None or len(mine) == 0:
             continue
         first = curved_silhouette.end(ends.world, ends.camera, ends.layers, found.front[mine], front=True)
@@ -254,13 +255,33 @@ def _test_curved(ends: _Ends) -> _Verdict:
             d_front[mine] = torch.where(meeting.marched, meeting.at.minimum(d_front[mine]), d_front[mine])
         if mdf.no_hit is not None:
             through = mine[~meeting.marched]
-            inside = Intervals(*(x[through] for x in found))
-            passed = _test_paper(
-                ends._replace(found=inside, t_front=ends.t_front[through], t_back=ends.t_back[through])
-            )
-            hit[through], d_front[through] = passed.hit, passed.d_front
+            hit[through], d_front[through], _ = _test_paper(_select(ends, through))
             deep[through] = False
+    # A march needs one relief from end to end; between two materials each end answers for itself.
+    between = (mixed & (relief[owner] >= 0)).nonzero()[:, 0]
+    if len(between):
+        hit[between], d_front[between], _ = _test_paper(_select(ends, between))
     return _Verdict(hit, d_front, int(deep.sum()))
+
+
+def _owner(ends: _Ends, fragment: Tensor) -> Tensor:
+    """Return the surfaces of fragments; -1 where there is none."""
+    owner = torch.full_like(fragment, -1)
+    there = (fragment >= 0).nonzero()[:, 0]
+    owner[there] = ends.world.owner[ends.layers.triangles.face[ends.layers.triangle[fragment[there]]]]
+    return owner
+
+
+def _relief(scene: Scene) -> Tensor:
+    """Return the number of the mesostructure of each surface, and behind them of none; -1 where there is no depth."""
+    numbers: dict[int, int] = {}
+    mdfs = [m.mdf for m in scene.surfaces]
+    return torch.tensor([-1 if m is None else numbers.setdefault(id(m), len(numbers)) for m in [*mdfs, None]])
+
+
+def _select(ends: _Ends, which: Tensor) -> _Ends:
+    found = Intervals(*(x[which] for x in ends.found))
+    return ends._replace(found=found, t_front=ends.t_front[which], t_back=ends.t_back[which])
 
 
 class _Look(NamedTuple):
@@ -276,8 +297,7 @@ class _Look(NamedTuple):
     def reach(self) -> Tensor:
         """Return the largest s D these angles can give; inf where a table holds an entry without a hit."""
         reach = torch.zeros_like(self.points.scale)
-        for i, item in enumerate(self.scene.objects):
-            mdf = item.material.mdf
+        for i, mdf in enumerate(m.mdf for m in self.scene.surfaces):
             if mdf is not None:
                 bound = self.points.scale * (mdf.delta_max * mdf.h) / self.w[:, 2].clamp(min=MIN_COS)
                 bound = bound if mdf.no_hit is None else torch.inf
@@ -291,8 +311,7 @@ class _Look(NamedTuple):
         bottom of the slab (open surfaces).
         """
         depth = torch.zeros_like(self.points.scale)
-        for i, item in enumerate(self.scene.objects):
-            mdf = item.material.mdf
+        for i, mdf in enumerate(m.mdf for m in self.scene.surfaces):
             mine = self.points.owner == i
             if mdf is None or not bool(mine.any()):
                 continue

@@ -1,0 +1,171 @@
+"""OBJ files: polygons with texture coordinates, parts named by `usemtl`, and the looks of their MTL file.
+
+Normals (`vn`) are left out, they are found anew; polygons become fans of triangles. Of an MTL file Kd, map_Kd and
+the normal map (norm, or map_Bump, map_Kn, bump, which exporters use for normal maps too) are read.
+
+Test: tests/geometry/test_obj.py
+"""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from torchmeso.errors import FormatError, GeometryError
+from torchmeso.geometry.mesh_file import Finish, Group, MeshFile
+
+NORMAL_MAPS = ("norm", "map_kn", "map_bump", "bump")
+"""Keys of an MTL file that name a normal map; the first one present counts."""
+
+
+def read(path: Path) -> MeshFile:
+    """Return what an OBJ file holds.
+
+    Raises:
+        FormatError: a line cannot be read.
+        GeometryError: there are no triangles, or coordinates that are not finite.
+    """
+    text = path.read_text(encoding="utf-8", errors="replace").replace("\\\n", " ")
+    positions, textures, polygons, groups, libraries = [], [], [], [], []
+    names: dict[str, int] = {}
+    group = -1
+    for line in text.splitlines():
+        key, _, rest = line.strip().partition(" ")
+        if key == "v":
+            positions.append(rest)
+        elif key == "vt":
+            textures.append(rest)
+        elif key == "f":
+            if group < 0:
+                group = names.setdefault("", len(names))
+            if "-" in rest:
+                rest = _absolute(rest, len(positions), len(textures))
+            polygons.append(rest.partition("#")[0])
+            groups.append(group)
+        elif key == "usemtl":
+            group = names.setdefault(rest.strip(), len(names))
+        elif key == "mtllib":
+            libraries.append(rest.strip())
+    try:
+        vertices = _columns(positions, 3)
+        corners, part = _triangles(polygons, np.array(groups, dtype=np.int64))
+        uv = _columns(textures, 2) if len(textures) and bool((corners[..., 1] >= 0).all()) else None
+        source, faces = _join(corners, uv is not None)
+        used_vertices = vertices[source[:, 0]]
+        used_uv = None if uv is None else torch.from_numpy(uv[source[:, 1]])
+    except GeometryError:
+        raise
+    except (ValueError, IndexError) as error:
+        raise FormatError(f"{path}: expected an OBJ file ({error})") from error
+    looks = {k: v for library in libraries for k, v in _read_mtl(path.parent / library).items()}
+    return MeshFile(
+        vertices=torch.from_numpy(used_vertices),
+        faces=torch.from_numpy(faces),
+        uv=used_uv,
+        part=torch.from_numpy(part),
+        groups=tuple(Group(name, looks.get(name)) for name in names),
+        uv_sets=int(uv is not None),
+    )
+
+
+def _columns(lines: list[str], count: int) -> np.ndarray:
+    """Return the first `count` numbers of every line; a missing second texture coordinate is 0."""
+    if not lines:
+        return np.zeros((0, count), np.float32)
+    rows = [line.partition("#")[0].split() for line in lines]
+    widths = {len(row) for row in rows}
+    if widths == {count}:
+        return np.array(rows, dtype=np.float32)
+    return np.array([(row + ["0"] * count)[:count] for row in rows], dtype=np.float32)
+
+
+def _absolute(polygon: str, n_position: int, n_texture: int) -> str:
+    """Return a face with numbers counted from the start of the file instead of from its own line."""
+    counts = (n_position, n_texture, 0)
+    corners = []
+    for corner in polygon.split():
+        fields = corner.split("/")
+        corners.append("/".join(str(int(x) + n + 1) if x.startswith("-") else x for x, n in zip(fields, counts)))  # noqa: B905
+    return " ".join(corners)
+
+
+def _triangles(polygons: list[str], groups: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return (F, 3, 2) position and texture of every triangle's corners, counted from 0, and each one's group."""
+    tokens = [p.split() for p in polygons]
+    size = np.array([len(t) for t in tokens], dtype=np.int64)
+    flat = [t for row in tokens for t in row]
+    if not flat or not (size >= 3).any():
+        raise GeometryError("expected triangles, got none")
+    pairs = np.array([(t + "//").split("/", 2)[:2] for t in flat])
+    pairs[pairs == ""] = "0"
+    corner = pairs.astype(np.int64) - 1
+    # A fan around each polygon's first corner.
+    fans = np.maximum(size - 2, 0)
+    polygon = np.repeat(np.arange(len(size)), fans)
+    k = np.arange(len(polygon)) - np.repeat(np.cumsum(fans) - fans, fans)
+    first = (np.cumsum(size) - size)[polygon]
+    return np.stack([corner[first], corner[first + k + 1], corner[first + k + 2]], 1), groups[polygon]
+
+
+def _join(corners: np.ndarray, textured: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Return the distinct pairs of position and texture, and faces that count them."""
+    flat = corners.reshape(-1, 2)
+    if flat[:, 0].min() < 0:
+        raise IndexError("a face names vertex 0; the first is 1")
+    key = flat[:, 0] * (flat[:, 1].max() + 2) + flat[:, 1] + 1 if textured else flat[:, 0]
+    _, first, number = np.unique(key, return_index=True, return_inverse=True)
+    return flat[first], number.reshape(-1, 3)
+
+
+def _read_mtl(path: Path) -> dict[str, Finish]:
+    """Return the looks of an MTL file by name; none where it is missing: meshes travel without it."""
+    if not path.is_file():
+        return {}
+    found: dict[str, dict[str, str]] = {}
+    here: dict[str, str] = {}
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+        key, _, rest = line.partition("#")[0].strip().partition(" ")
+        if key == "newmtl":
+            here = found.setdefault(rest.strip(), {})
+        elif key:
+            here[key.lower()] = rest.strip()
+    return {name: _finish(keys, path) for name, keys in found.items()}
+
+
+def _finish(keys: dict[str, str], path: Path) -> Finish:
+    normal = next((keys[k] for k in NORMAL_MAPS if k in keys), None)
+    scale, colour = 1.0, (1.0, 1.0, 1.0) if "map_kd" in keys else (0.6, 0.6, 0.6)
+    try:
+        if "kd" in keys:
+            r, g, b = (float(x) for x in keys["kd"].split()[:3])
+            colour = r, g, b
+        if normal is not None and "-bm" in normal.split():
+            scale = float(normal.split()[normal.split().index("-bm") + 1])
+    except (ValueError, IndexError) as error:
+        raise FormatError(f"{path}: expected numbers for Kd and -bm ({error})") from error
+    return Finish(
+        albedo=colour,
+        albedo_map=_picture(keys.get("map_kd"), path),
+        normal_map=_picture(normal, path),
+        normal_scale=scale,
+    )
+
+
+def _picture(statement: str | None, path: Path) -> Path | None:
+    """Return the file that a map statement names, whose name stands behind its options (and may hold spaces)."""
+    if statement is None:
+        return None
+    words = statement.split(" ")
+    while words and words[0].startswith("-"):
+        words.pop(0)
+        while words and _is_number(words[0]) | (words[0] in ("on", "off")):
+            words.pop(0)
+    return path.parent / " ".join(words).replace("\\", "/")
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True

@@ -1,0 +1,46 @@
+"""Meshes for other renderers: a mesh file, or the objects of a configuration where they stand, as GLB with tangents.
+
+Test: tests/pipeline/test_export.py
+"""
+
+from pathlib import Path
+
+from torchmeso import config
+from torchmeso.data.store import replacing
+from torchmeso.geometry import glb, mesh, mesh_file
+from torchmeso.geometry.glb import Body
+from torchmeso.geometry.mesh_file import Finish, Group
+from torchmeso.pipeline import scene
+
+
+def to_glb(path: str | Path, out: str | Path) -> None:
+    """Write `path`, a mesh file or a configuration, as a GLB file: normals, tangents, texture coordinates, parts.
+
+    Parts keep the looks that glTF has words for (colour, normal map); materials with a mesostructure leave their name.
+
+    Raises:
+        MesoError: a file is missing or unreadable, or a mesh has no texture coordinates.
+    """
+    path = Path(path)
+    if path.suffix.lower() in (".yaml", ".yml"):
+        bodies = _of_configuration(config.load(path))
+    else:
+        found = mesh_file.read(path)
+        bodies = [Body(path.stem, mesh.dress_file(found, name=path.name), found.part, found.groups)]
+    with replacing(out) as beside:
+        beside.write_bytes(glb.encode(bodies))
+
+
+def _of_configuration(settings: config.Config) -> list[Body]:
+    bodies = []
+    for item, body in zip(settings.objects, scene.read_bodies(settings), strict=True):
+        groups = tuple(_group(settings, look, k) for k, look in enumerate(body.looks))
+        name = item.shape or Path(str(item.mesh)).stem
+        bodies += [Body(name, mesh.transform(body.mesh, place), body.part, groups) for place in item.places()]
+    return bodies
+
+
+def _group(settings: config.Config, look: str | Finish, k: int) -> Group:
+    if isinstance(look, Finish):
+        return Group(f"look_{k}", look)
+    return Group(look, settings.materials[look].finish)
