@@ -75,6 +75,20 @@ def test_texture_coordinates_that_some_faces_lack_are_none(tmp_path):
     assert mesh_file.read(tmp_path / "a.obj").uv is None
 
 
+@pytest.mark.parametrize("corners", ["1/1 2/2 3/3", "1/1/1 2/2/1 3/3/1", "1//1 2//1 3//1", "1 2 3", " 1/1  2/2 3/3 "])
+@pytest.mark.parametrize("others", ["", "f 1/1 2/2 3/3\n", "f 1 2 3\n"])
+def test_corners_are_written_in_many_ways(corners, others, tmp_path):
+    (tmp_path / "a.obj").write_text(
+        f"v 0 0 0\nv 1 0 0\nv 0 1 0 # end\nvt 0 0\nvt 1\nvt 0 1 0\nvn 0 0 1\nf {corners}\n{others}"
+    )
+    found = mesh_file.read(tmp_path / "a.obj")
+    assert found.vertices[found.faces[0]].tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
+    textured = "//" not in corners and "/" in corners and others != "f 1 2 3\n"
+    assert (found.uv is not None) == textured
+    if found.uv is not None:
+        assert found.uv[found.faces[0]].tolist() == [[0, 0], [1, 0], [0, 1]]
+
+
 @pytest.mark.errors
 @pytest.mark.parametrize(
     ("text", "kind", "message"),

@@ -476,3 +476,19 @@ def test_pictures_of_colours_and_normals(rule, brick, device, rng):
     assert wrong <= 4
     alike = (exact.owner == fast.owner) & (exact.shadowed == fast.shadowed).all(0)
     assert (exact.rgb - fast.rgb)[alike].abs().quantile(0.99) < 3e-4
+
+
+@pytest.mark.slow
+def test_a_million_triangles_in_instances(brick, device):
+    """A crowd of knots, looked at closely: what torch shows in float64, to the last fragment."""
+    knot = shapes.torus_knot(tiles=(20, 2))
+    places = [torch.diag(torch.tensor([0.2, 0.2, 0.2, 1.0])) for _ in range(84)]
+    for i, place in enumerate(places):
+        place[:2, 3] = torch.tensor([i % 10 - 4.5, i // 10 - 4.0]) * 0.64
+    objects = tuple(Object(mesh=mesh.transform(knot, place), material=brick) for place in places)
+    assert sum(len(o.mesh.faces) for o in objects) > 1_000_000
+    scene, options = Scene(objects=objects, lights=LIGHTS["sun"]), FrameOptions(shadows=False)
+    view = camera((1.1, 0.7, 8.0), at=(1.1, 0.7, 0.0), size=64, fov_deg=4)
+    exact, fast = frame.render(in_double(scene), view, options), Renderer(scene, options).render(view)
+    assert exact.counts["fragments"] == fast.counts["fragments"] > 1000
+    assert ((exact.rgb - fast.rgb).abs().amax(-1) > 1 / 255).sum() <= 4

@@ -72,11 +72,12 @@ def _columns(lines: list[str], count: int) -> np.ndarray:
     """Return the first `count` numbers of every line; a missing second texture coordinate is 0."""
     if not lines:
         return np.zeros((0, count), np.float32)
-    rows = [line.partition("#")[0].split() for line in lines]
-    widths = {len(row) for row in rows}
-    if widths == {count}:
-        return np.array(rows, dtype=np.float32)
-    return np.array([(row + ["0"] * count)[:count] for row in rows], dtype=np.float32)
+    flat = " ".join(lines)
+    rows = [line.split() for line in lines] if "#" not in flat else [line.partition("#")[0].split() for line in lines]
+    if {len(row) for row in rows} != {count}:
+        flat = " ".join(" ".join((row + ["0"] * count)[:count]) for row in rows)
+    # float() of Python reads text faster than numpy does.
+    return np.fromiter(map(float, flat.split()), np.float32, count * len(rows)).reshape(-1, count)
 
 
 def _absolute(polygon: str, n_position: int, n_texture: int) -> str:
@@ -91,20 +92,28 @@ def _absolute(polygon: str, n_position: int, n_texture: int) -> str:
 
 def _triangles(polygons: list[str], groups: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return (F, 3, 2) position and texture of every triangle's corners, counted from 0, and each one's group."""
-    tokens = [p.split() for p in polygons]
-    size = np.array([len(t) for t in tokens], dtype=np.int64)
-    flat = [t for row in tokens for t in row]
-    if not flat or not (size >= 3).any():
+    size = np.array([len(p.split()) for p in polygons], dtype=np.int64)
+    if not (size >= 3).any():
         raise GeometryError("expected triangles, got none")
-    pairs = np.array([(t + "//").split("/", 2)[:2] for t in flat])
-    pairs[pairs == ""] = "0"
-    corner = pairs.astype(np.int64) - 1
+    corner = _corners(polygons, size) - 1
     # A fan around each polygon's first corner.
     fans = np.maximum(size - 2, 0)
     polygon = np.repeat(np.arange(len(size)), fans)
     k = np.arange(len(polygon)) - np.repeat(np.cumsum(fans) - fans, fans)
     first = (np.cumsum(size) - size)[polygon]
     return np.stack([corner[first], corner[first + k + 1], corner[first + k + 2]], 1), groups[polygon]
+
+
+def _corners(polygons: list[str], size: np.ndarray) -> np.ndarray:
+    """Return (corners, 2) numbers of position and texture as they are written, 0 where there is none."""
+    text = " ".join(polygons).replace("//", "/0/")
+    fields = {p.count("/") / n for p, n in zip(polygons, size.tolist(), strict=True) if n}
+    if len(fields) == 1 and fields <= {0.0, 1.0, 2.0}:  # all are written alike
+        width = int(fields.pop()) + 1
+        numbers = np.fromiter(map(int, text.replace("/", " ").split()), np.int64).reshape(-1, width)
+        return numbers[:, :2] if width > 1 else np.concatenate([numbers, np.zeros_like(numbers)], 1)
+    pairs = [(token + "/0").split("/")[:2] for token in text.split()]
+    return np.array([(int(a), int(b)) for a, b in pairs], dtype=np.int64)
 
 
 def _join(corners: np.ndarray, textured: bool) -> tuple[np.ndarray, np.ndarray]:
