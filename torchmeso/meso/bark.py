@@ -7,7 +7,7 @@ Test: tests/meso/test_bark.py
 """
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchmeso.data.address import texel_centres
@@ -80,7 +80,7 @@ def bark(
 
 def _voronoi(
     place: Float[Tensor, "n 2"], point: Float[Tensor, "rows columns 2"]
-) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
+) -> tuple[Float[Tensor, "n"], Int[Tensor, "n"]]:
     """Return the distance to the nearest edge of the Voronoi diagram, and whose cell it is.
 
     Places are in lattice units; the feature point of cell (i, j) lies at (j, i) + point[i, j], and repeats.
