@@ -332,7 +332,7 @@ class Renderer:
              picture.lights.buffer, lights.views, lights.slots, lights.labels, lights.counters, *stored,
              picture.frame.buffer, *self._layers(),
              *(b for b, _ in picture.results), picture.empty.buffer),
-            self._defines,
+            (*self._defines, *(["-DSHADOWS"] * self.options.shadows)),
         )  # fmt: skip
 
 
