@@ -1,7 +1,7 @@
 // A frame: tiles of the camera's picture are filled, tested and shaded while they lie in the cache.
 // Host: torchmeso/render/renderer.py
 //
-// Compiled with SILHOUETTE and MIXED (see silhouette.clh), and ONE_LAYER.
+// Compiled with SILHOUETTE and MIXED (see silhouette.clh), ONE_LAYER, and SHADOWS where lights have maps.
 
 #include "data/textured.clh"
 #include "render/shadow_map.clh"
@@ -192,7 +192,11 @@ static void draw_stamp(const Place *place, const Target *target, const Rays *ray
                         ? facing(lights + i, &seen->at.n, &seen->position, shaded) : shaded;
         tally->averted += __builtin_popcount(shaded & ~asked);
         const int first = lights[i].first_face, count = lights[i].faces;
+#ifdef SHADOWS
         blocked[i] = asked ? blocked_from(place, &target->shadows, first, count, &receiver, asked) : 0;
+#else
+        blocked[i] = 0;
+#endif
         if (!(frame->outputs & OWNER)) continue;
         for (int l = 0; l < 16; l++)
             target->shadowed[i * plane + (rays->y + (l >> 2)) * frame->pitch + rays->x + (l & 3)] = blocked[i] >> l & 1;
@@ -414,6 +418,7 @@ static INNER void draw_tiles(const int worker, __global const View *restrict vie
             tally.deepest = MAX(tally.deepest, filled);
             for (int k = 0; k < filled; k++)
                 tally.fragments += __builtin_popcount(lanes & to_bits(key_of[k] < INFINITY));
+#ifdef SHADOWS
             // What is seen lies near the first fragment: its shadow is asked for before all else.
             const int near = lanes & to_bits(key_of[0] < INFINITY);
             const float16 first = view->perspective ? -rays.stretch / key_of[0] : key_of[0];
@@ -421,6 +426,7 @@ static INNER void draw_tiles(const int worker, __global const View *restrict vie
                                      rays.origin.z + first * rays.direction.z};
             for (int i = 0; i < frame->lights; i++)
                 if (lights[i].faces == 1) fetch_shadow_ahead(&shadows, lights[i].first_face, &nearest, near);
+#endif
             const Seen seen = look(&place, &rays, key_of, slot + lists.begin[s], filled, lanes, &target, &tally);
             draw_stamp(&place, &target, &rays, &seen, &tally);
         }

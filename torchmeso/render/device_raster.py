@@ -227,6 +227,10 @@ class DeviceViews:
         """Wait, and return what each view did."""
         return [dict(zip(COUNTERS, row, strict=False)) for row in self._counters.receive().tolist()]
 
+    def total(self, name: str) -> int:
+        """Wait, and return one of `COUNTERS` of all views together."""
+        return int(self._counters.receive()[:, COUNTERS.index(name)].sum())
+
     def room_for_cuts(self) -> int:
         """Return triangles that cut faces may become."""
         return self.stride - self.padded

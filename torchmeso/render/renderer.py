@@ -155,8 +155,8 @@ class Renderer:
             )
             drawn = maps is not None and self._draw_maps(maps, lights)
             self._draw_picture(picture, camera, lights, outputs)
-            counts, light_counts = picture.views.counts(), maps.views.counts() if maps else []
-            if self._fits(counts + light_counts):
+            counts = picture.views.counts()
+            if self._fits(counts + (maps.views.counts() if drawn and maps else [])):
                 break
         opencl.read(picture.results[:1] if outputs == DISPLAY else picture.results[1:])
         picture.lit = (len(given), reaching)
@@ -165,7 +165,7 @@ class Renderer:
             "lights left out": len(given) - len(reaching),
             "shadow maps drawn": faces if drawn else 0,
             "shadow maps kept": 0 if drawn else faces,
-            "shadow stamps left out": sum(c["stamps"] - c["asked"] for c in light_counts),
+            "shadow stamps left out": maps.views.total("stamps") - maps.views.total("asked") if maps else 0,
             "triangles kept": counts[0]["drawn"] if stays else 0,
             "frames without silhouette code": int(self._plain),
             **self._uploaded,
@@ -344,7 +344,7 @@ class Renderer:
              picture.lights.buffer, lights.views, lights.slots, lights.labels, lights.counters, *stored,
              picture.frame.buffer, *self._layers(),
              *(b for b, _ in picture.results), picture.empty.buffer),
-            self._defines,
+            (*self._defines, *(["-DSHADOWS"] * self.options.shadows)),
         )  # fmt: skip
 
 
