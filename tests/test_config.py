@@ -64,8 +64,8 @@ def test_mesostructure_takes_its_generators_arguments():
 
 def test_objects_are_scaled_then_turned_then_moved():
     item = ObjectConfig(shape="sphere", material="x", scale=2, rotate_deg=(0, 90, 0), translate=(1, 0, 0))
-    moved = item.matrix() @ torch.tensor([1.0, 0, 0, 1])
-    torch.testing.assert_close(moved, torch.tensor([1.0, 0, -2, 1]), rtol=0, atol=1e-6)
+    moved = item.matrix() @ torch.tensor([1.0, 0, 0, 1], dtype=torch.float64)
+    torch.testing.assert_close(moved, torch.tensor([1.0, 0, -2, 1], dtype=torch.float64), rtol=0, atol=1e-6)
 
 
 def test_lights_and_camera():

@@ -40,7 +40,7 @@ Vector = tuple[float, float, float]
 class _Strict(BaseModel):
     """Frozen, and nothing but the known keys."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True, allow_inf_nan=False)
 
 
 def _from_pictures(
@@ -212,7 +212,7 @@ class ObjectConfig(_Strict):
             turn[j, i], turn[i, j] = a.sin(), -a.sin()
             result = turn @ result
         result[:3, 3] = torch.tensor(self.translate, dtype=torch.float64)
-        return result.float()
+        return result
 
 
 class DirectionalConfig(_Strict):
@@ -239,7 +239,8 @@ class PointConfig(_Strict):
 
     def build(self) -> Light:
         """Return the light."""
-        return PointLight(position=torch.tensor(self.position), intensity=torch.tensor(self.intensity))
+        position = torch.tensor(self.position, dtype=torch.float64)
+        return PointLight(position=position, intensity=torch.tensor(self.intensity))
 
 
 class SpotConfig(_Strict):
@@ -254,11 +255,12 @@ class SpotConfig(_Strict):
 
     def build(self) -> Light:
         """Return the light."""
-        axis = torch.tensor(self.at, dtype=torch.float32) - torch.tensor(self.position)
+        position = torch.tensor(self.position, dtype=torch.float64)
+        axis = (torch.tensor(self.at, dtype=torch.float64) - position).float()
         if float(axis.norm()) == 0:
             raise ConfigError("lights.at: expected another place than the light's position")
         return SpotLight(
-            position=torch.tensor(self.position),
+            position=position,
             axis=axis / axis.norm(),
             intensity=torch.tensor(self.intensity),
             inner_deg=self.inner_deg,

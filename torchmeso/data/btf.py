@@ -19,9 +19,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchmeso.data import address, store
-from torchmeso.errors import FormatError, ShapeError, check_shape
+from torchmeso.errors import FormatError, ShapeError, check_finite, check_shape
 from torchmeso.geometry import hemisphere
 from torchmeso.geometry.hemisphere import DirectionSet
+
+LARGEST = 1e15
+"""Values of T beyond it are damage, not light: their squares would not fit into the float32 sums of a fit."""
 
 
 @runtime_checkable
@@ -58,6 +61,8 @@ class Btf:
     def __post_init__(self) -> None:
         """Raise ShapeError unless the directions match the images."""
         check_shape("btf.images", self.images, (len(self.lights), len(self.views), -1, -1, 3))
+        if min(self.texels) < 1:
+            raise ShapeError(f"btf.images: expected at least one texel, got {self.texels[1]} x {self.texels[0]}")
 
     @property
     def texels(self) -> tuple[int, int]:
@@ -68,25 +73,32 @@ class Btf:
         """Return texel rows start .. stop of all pictures as float32, reading no others.
 
         Raises:
-            ShapeError: a value is not finite (the place is named).
+            ShapeError: a value is not finite, or beyond `LARGEST` (the place is named, the others are counted).
         """
         if isinstance(self.images, Tensor):
             band = self.images[:, :, start:stop].float()
         else:
             band = torch.from_numpy(np.asarray(self.images[:, :, start:stop])).float()
-        if not bool(torch.isfinite(band).all()):
-            light, view, row, column, _ = (~torch.isfinite(band)).nonzero()[0].tolist()
+        wrong = ~((band <= LARGEST) & (band >= -LARGEST))
+        if bool(wrong.any()):
+            light, view, row, column, channel = wrong.nonzero()[0].tolist()
+            value = float(band[light, view, row, column, channel])
             raise ShapeError(
-                f"btf.images: expected finite values, got {float(band[light, view, row, column].sum())} "
-                f"at light {light}, view {view}, row {start + row}, column {column}"
+                f"btf.images: expected finite values up to {LARGEST:g}, got {value:g} at light {light}, view {view}, "
+                f"row {start + row}, column {column}, and {int(wrong.sum()) - 1} more "
+                f"in rows {start} to {start + band.shape[2] - 1}; repair or mask them before fitting"
             )
         return band
 
     def pictures(self) -> Float[Tensor, "light view H W 3"]:
-        """Return all pictures, read into memory, in the dtype they are stored in."""
-        if isinstance(self.images, Tensor):
-            return self.images
-        return torch.from_numpy(np.asarray(self.images[:]))
+        """Return all pictures, read into memory, in the dtype they are stored in.
+
+        Raises:
+            ShapeError: a value is not finite.
+        """
+        images = self.images if isinstance(self.images, Tensor) else torch.from_numpy(np.asarray(self.images[:]))
+        check_finite("btf.images", images)
+        return images
 
     def evaluate(
         self, uv: Float[Tensor, "*batch 2"], wi: Float[Tensor, "*batch 3"], wo: Float[Tensor, "*batch 3"]

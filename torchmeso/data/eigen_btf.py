@@ -20,7 +20,7 @@ from torch import Tensor
 from torchmeso.data import address, mdf, store
 from torchmeso.data.btf import horizon_falloff
 from torchmeso.data.mdf import Mdf
-from torchmeso.errors import FormatError, ShapeError, check_shape
+from torchmeso.errors import FormatError, ShapeError, check_finite, check_shape
 from torchmeso.geometry import hemisphere
 from torchmeso.geometry.hemisphere import DirectionSet
 
@@ -54,6 +54,13 @@ class EigenBtf:
         check_shape("eigen.offset", self.offset, (rank, 3))
         if self.maps.dtype != torch.uint8 and not self.maps.is_floating_point():
             raise ShapeError(f"eigen.maps: expected uint8 or a float type, got {self.maps.dtype}")
+        if rank < 1 or min(self.texels) < 1:
+            raise ShapeError(f"eigen.maps: expected at least one component and texel, got {tuple(self.maps.shape)}")
+        floats = {"weights": self.weights, "scale": self.scale, "offset": self.offset}
+        for name, values in (
+            floats.items() if self.maps.dtype == torch.uint8 else (*floats.items(), ("maps", self.maps))
+        ):
+            check_finite(f"eigen.{name}", values)
 
     @property
     def rank(self) -> int:

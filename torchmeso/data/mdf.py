@@ -21,7 +21,7 @@ from torch import Tensor
 
 from torchmeso.data import address, store
 from torchmeso.data.relief import Relief, from_views
-from torchmeso.errors import FormatError, ShapeError, check_range, check_shape
+from torchmeso.errors import FormatError, ShapeError, check_finite, check_range, check_shape
 from torchmeso.geometry import hemisphere
 from torchmeso.geometry.hemisphere import DirectionSet
 
@@ -52,6 +52,10 @@ class Mdf:
             raise ShapeError(f"mdf.delta: expected uint8, float16, float32 or float64, got {self.delta.dtype}")
         if self.no_hit is not None:
             check_shape("mdf.no_hit", self.no_hit, tuple(self.delta.shape))
+        if min(self.texels) < 1:
+            raise ShapeError(f"mdf.delta: expected at least one texel, got {self.texels[1]} x {self.texels[0]}")
+        if self.delta.dtype != torch.uint8:
+            check_finite("mdf.delta", self.delta, 0, 1)
         check_range("mdf.h", self.h, 1e-6, 1e3)
 
     @property

@@ -25,6 +25,12 @@ from torchmeso.geometry.directions import dot, normalize
 CREASE_DEG = 60.0
 """Faces that meet at a sharper angle (degrees between normals) do not share a vertex normal."""
 
+FAR = 64.0
+"""Meshes farther from the origin than this many times their size keep float64 positions."""
+
+FARTHEST, MOST_TILES = 1e15, 1e5
+"""Positions, and extents of texture coordinates, beyond which float32 arithmetic has no meaning."""
+
 ANISOTROPY_WARNING = 2.0
 """Mean ratio of the singular values of the texture map above which `load` and `dress` warn."""
 
@@ -34,7 +40,7 @@ class Mesh:
     """A mesh ready to be dressed; every per-vertex array has the same length V.
 
     Attributes:
-        vertices: (V, 3) world positions.
+        vertices: (V, 3) world positions; float64 where the mesh lies far from the origin (`FAR`).
         faces: (F, 3) vertex numbers, counter-clockwise seen from outside.
         uv: (V, 2) texture coordinates in tiles, unbounded, v up.
         normals: (V, 3) unit, outwards.
@@ -106,12 +112,13 @@ def read_arrays(path: str | Path) -> tuple[Float[Tensor, "V 3"], Int[Tensor, "F 
         raise GeometryError(f"{path.name}: expected triangles, got none")
     uvs = [getattr(part.visual, "uv", None) for part in parts]
     first = np.cumsum([0, *(len(part.vertices) for part in parts)])
-    vertices = torch.from_numpy(np.concatenate([part.vertices for part in parts]).astype(np.float32))
+    vertices = torch.from_numpy(np.concatenate([part.vertices for part in parts]).astype(np.float64))
     faces = torch.from_numpy(
         np.concatenate([part.faces + n for part, n in zip(parts, first[:-1], strict=True)]).astype(np.int64)
     )
     if not torch.isfinite(vertices).all():
         raise GeometryError(f"{path.name}: expected finite vertex positions, got NaN or infinity")
+    vertices = _sharp(vertices, torch.float32)
     found = [uv for uv in uvs if uv is not None and len(uv)]
     if len(found) < len(parts):
         return vertices, faces, None
@@ -132,11 +139,17 @@ def dress(
         name: what warnings and errors call the mesh.
 
     Raises:
-        GeometryError: no face has both world and texture area, or a value is not finite.
+        GeometryError: no face has both world and texture area, a value is not finite or too large, or a face names a
+            vertex that is not there.
     """
-    if not (torch.isfinite(vertices).all() and torch.isfinite(uv).all()):
-        raise GeometryError(f"{name}: expected finite positions and texture coordinates, got NaN or infinity")
+    _check_arrays(name, vertices, faces, uv)
+    uv = _near_zero(uv)
     found = components.find(vertices, faces)
+    twin = components.twins(found, vertices, faces)
+    if bool(twin.any()):
+        warnings.warn(f"{name}: {int(twin.sum())} faces lay back to back on others and were left out", stacklevel=2)
+        faces = faces[~twin]
+        found = components.find(vertices, faces)
     flip = components.inside_out(found, vertices, faces)[found.of_face]
     if bool(flip.any()):
         warnings.warn(f"{name}: {int(flip.sum())} faces of closed parts looked inwards and were turned", stacklevel=2)
@@ -148,7 +161,7 @@ def dress(
     _warn_about_anisotropy(name, jacobian, usable)
 
     position = components.weld(vertices)
-    corner_normal = _corner_normals(vertices, faces, position)
+    corner_normal = _corner_normals(vertices, faces, position).to(uv.dtype)
     handed = torch.where(jacobian.uv_area < 0, -1.0, 1.0)
     split = _split(faces, corner_normal, handed)
     source = split.source
@@ -163,8 +176,8 @@ def dress(
         uv=uv[source],
         normals=normals,
         tangents=tangents,
-        sign=sign.to(vertices.dtype),
-        scale=scale.to(vertices.dtype),
+        sign=sign.to(uv.dtype),
+        scale=scale.to(uv.dtype),
         component=found.of_face,
         closed=found.closed,
     )
@@ -181,14 +194,50 @@ def transform(mesh: Mesh, matrix: Float[Tensor, "4 4"]) -> Mesh:
     rotation = linear / size
     if linear.det() <= 0 or not torch.allclose(rotation @ rotation.T, torch.eye(3, dtype=torch.float64), atol=1e-5):
         raise GeometryError("transform: expected rotation, positive uniform scale and translation only")
-    dtype = mesh.vertices.dtype
+    dtype = mesh.normals.dtype
     return replace(
         mesh,
-        vertices=(mesh.vertices.double() @ linear.T + matrix[:3, 3].double()).to(dtype),
+        vertices=_sharp(mesh.vertices.double() @ linear.T + matrix[:3, 3].double(), dtype),
         normals=(mesh.normals.double() @ rotation.T).to(dtype),
         tangents=(mesh.tangents.double() @ rotation.T).to(dtype),
         scale=mesh.scale * size.to(dtype),
     )
+
+
+def _check_arrays(name: str, vertices: Tensor, faces: Tensor, uv: Tensor) -> None:
+    if not (torch.isfinite(vertices).all() and torch.isfinite(uv).all()):
+        raise GeometryError(f"{name}: expected finite positions and texture coordinates, got NaN or infinity")
+    if len(faces) == 0:
+        raise GeometryError(f"{name}: expected triangles, got none")
+    if int(faces.min()) < 0 or int(faces.max()) >= len(vertices):
+        found = f"{int(faces.min())} to {int(faces.max())}"
+        raise GeometryError(f"{name}: expected vertex numbers from 0 to {len(vertices) - 1}, got {found}")
+    if float(vertices.abs().max()) > FARTHEST:
+        raise GeometryError(
+            f"{name}: expected positions within {FARTHEST:g} of the origin, got {float(vertices.abs().max()):g}"
+        )
+    extent = float((uv.amax(0) - uv.amin(0)).max())
+    if extent > MOST_TILES:
+        raise GeometryError(
+            f"{name}: expected texture coordinates over at most {MOST_TILES:g} tiles, got {extent:g}; "
+            "single precision could not tell their texels apart"
+        )
+
+
+def _near_zero(uv: Tensor) -> Tensor:
+    """Return texture coordinates moved by whole tiles where they lie far from 0, so that fractions stay sharp."""
+    low, high = uv.double().aminmax(dim=0)
+    middle = (low + high) / 2
+    far = middle.abs() > 16 + (high - low)
+    return (uv.double() - torch.where(far, middle.floor(), 0.0)).to(uv.dtype)
+
+
+def _sharp(vertices: Float[Tensor, "V 3"], dtype: torch.dtype) -> Float[Tensor, "V 3"]:
+    """Return float64 positions in `dtype`, or as they are where they lie so far out that it would blur them."""
+    if len(vertices) == 0:
+        return vertices.to(dtype)
+    size = float((vertices.amax(0) - vertices.amin(0)).max())
+    return vertices if float(vertices.abs().max()) > FAR * size else vertices.to(dtype)
 
 
 class _Jacobian(NamedTuple):
@@ -259,7 +308,7 @@ def _corner_normals(vertices: Tensor, faces: Tensor, position: Tensor) -> Tensor
     normal = torch.zeros(3 * len(faces), 3, dtype=torch.float64).index_add_(0, i, weighted)
     lost = normal.norm(dim=-1) < 1e-12  # around faces without area any unit vector will do
     normal[lost] = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-    return normalize(normal).to(vertices.dtype).reshape(-1, 3, 3)
+    return normalize(normal).reshape(-1, 3, 3)
 
 
 class _Split(NamedTuple):

@@ -97,7 +97,7 @@ def from_file(
         GeometryError: it has no triangles, or is deeper than `h`.
     """
     vertices, faces, _ = mesh.read_arrays(path)
-    vertices = vertices - torch.tensor([0.0, 0.0, float(vertices[:, 2].max())])
+    vertices = (vertices - torch.tensor([0.0, 0.0, float(vertices[:, 2].max())])).float()
     depth = max(float(-vertices[:, 2].min()), 1e-6) if h is None else h
     part = torch.zeros(len(faces), dtype=torch.long)
     geometry = Geometry(vertices=vertices, faces=faces, part=part, palette=palette((albedo, roughness, f0)))

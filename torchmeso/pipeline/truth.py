@@ -82,7 +82,7 @@ def geometries(config: Config) -> list[Geometry]:
             assert material.albedo is not None
             part = torch.zeros(len(body.faces), dtype=torch.long)
             colour = palette((material.albedo, 1.0, 0.0))
-            result.append(Geometry(vertices=body.vertices, faces=body.faces, part=part, palette=colour))
+            result.append(Geometry(vertices=body.vertices.float(), faces=body.faces, part=part, palette=colour))
         else:
             result.append(displace(body, mesos[item.material], max_edge=config.truth.max_edge))
     return result
