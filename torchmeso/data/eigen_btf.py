@@ -168,12 +168,15 @@ def load(path: str | Path, *, rank: int | None = None) -> EigenBtf:
     about = model.meta.get("eigen")
     if about is None:
         raise FormatError(f"{path}: expected an eigen BTF, found {', '.join(model.names()) or 'nothing'}")
-    kept = about["rank"] if rank is None else min(rank, about["rank"])
-    return EigenBtf(
-        maps=torch.stack([model.read(f"eigen.map.{k}") for k in range(kept)], -2),
-        weights=model.read("eigen.weights")[:, :kept],
-        scale=model.read("eigen.scale")[:kept],
-        offset=model.read("eigen.offset")[:kept],
-        lights=hemisphere.parse(about["lights"]),
-        views=hemisphere.parse(about["views"]),
-    )
+    with store.reading(path):
+        kept = about["rank"] if rank is None else min(rank, about["rank"])
+        if kept < 1:
+            raise FormatError(f"{path}: expected at least one component, got {kept}; the copy may be incomplete")
+        return EigenBtf(
+            maps=torch.stack([model.read(f"eigen.map.{k}") for k in range(kept)], -2),
+            weights=model.read("eigen.weights")[:, :kept],
+            scale=model.read("eigen.scale")[:kept],
+            offset=model.read("eigen.offset")[:kept],
+            lights=hemisphere.parse(about["lights"]),
+            views=hemisphere.parse(about["views"]),
+        )

@@ -96,6 +96,7 @@ def read_arrays(path: str | Path) -> tuple[Float[Tensor, "V 3"], Int[Tensor, "F 
     Raises:
         FormatError: the file is missing or unreadable.
         GeometryError: it holds no triangles, or coordinates that are not finite.
+        ShapeError: positions have not three coordinates, or texture coordinates not two.
     """
     import trimesh
 
@@ -110,6 +111,8 @@ def read_arrays(path: str | Path) -> tuple[Float[Tensor, "V 3"], Int[Tensor, "F 
     parts = [part for part in parts if isinstance(part, trimesh.Trimesh) and len(part.faces)]
     if not parts:
         raise GeometryError(f"{path.name}: expected triangles, got none")
+    for part in parts:
+        check_shape(f"{path.name}: vertices", part.vertices, (-1, 3))
     uvs = [getattr(part.visual, "uv", None) for part in parts]
     first = np.cumsum([0, *(len(part.vertices) for part in parts)])
     vertices = torch.from_numpy(np.concatenate([part.vertices for part in parts]).astype(np.float64))
@@ -122,6 +125,8 @@ def read_arrays(path: str | Path) -> tuple[Float[Tensor, "V 3"], Int[Tensor, "F 
     found = [uv for uv in uvs if uv is not None and len(uv)]
     if len(found) < len(parts):
         return vertices, faces, None
+    for uv, part in zip(found, parts, strict=True):
+        check_shape(f"{path.name}: texture coordinates", uv, (len(part.vertices), 2))
     return vertices, faces, torch.from_numpy(np.concatenate(found).astype(np.float32))
 
 
@@ -205,6 +210,9 @@ def transform(mesh: Mesh, matrix: Float[Tensor, "4 4"]) -> Mesh:
 
 
 def _check_arrays(name: str, vertices: Tensor, faces: Tensor, uv: Tensor) -> None:
+    check_shape(f"{name}: vertices", vertices, (-1, 3))
+    check_shape(f"{name}: faces", faces, (-1, 3))
+    check_shape(f"{name}: texture coordinates", uv, (len(vertices), 2))
     if not (torch.isfinite(vertices).all() and torch.isfinite(uv).all()):
         raise GeometryError(f"{name}: expected finite positions and texture coordinates, got NaN or infinity")
     if len(faces) == 0:

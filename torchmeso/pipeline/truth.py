@@ -62,7 +62,6 @@ def render(config: Config, report: Report = silent) -> Truth:
     report("truth: displaced mesh", 1)
     camera, lights = config.camera.build(), [light.build() for light in config.lights]
     found = _trace(config, tracer, camera, lights, report)
-    path.parent.mkdir(parents=True, exist_ok=True)
     store.write_model(path, {"rgb": found.rgb, "depth": found.depth, "owner": found.owner}, {"kind": "truth"})
     return found
 
