@@ -106,6 +106,7 @@ REFUSED = [
     (["render", "none.yaml", "--out", "x.png"], "expected a configuration (.yaml), found none"),
     (["render", "small.yaml", "--out", "x.gif"], "expected a name that ends in .png or .exr"),
     (["render", "small.yaml", "--out", "small.yaml.png"], "exists already; give --force"),
+    (["render", "small.yaml", "--frames", "2", "--truth", "--out", "x.gif"], "--truth makes one picture"),
     (["compare", "none.png", "none.png"], "expected a picture, found none"),
 ]
 
@@ -168,3 +169,12 @@ def test_importing_the_command_line_is_cheap():
 def test_png_keeps_colours(tmp_path):
     image.write_png(tmp_path / "a.png", torch.full((2, 2, 3), 0.5))
     assert "largest value: 0.5" in run("info", tmp_path / "a.png").stdout
+
+
+@pytest.mark.errors
+def test_the_package_has_its_stages_only():
+    import torchmeso
+
+    assert torchmeso.render.__name__ == "torchmeso.render"
+    with pytest.raises(AttributeError, match="module 'torchmeso' has no attribute 'studios'"):
+        torchmeso.studios  # noqa: B018

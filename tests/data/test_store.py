@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from safetensors import SafetensorError
 from safetensors.torch import save_file
 
 from torchmeso.data import store
@@ -228,3 +229,14 @@ def test_damage_is_named(tmp_path):
     meta.write_text(meta.read_text().replace('"format": 1', '"format": "one"'))
     with pytest.raises(FormatError, match="expected a format number, got 'one'"):
         store.open_table(tmp_path / "c.zarr", "toy")
+
+
+@pytest.mark.errors
+def test_a_model_that_cannot_be_written(tmp_path, monkeypatch):
+    def fail(*_, **__):
+        raise SafetensorError("No space left on device")
+
+    monkeypatch.setattr("safetensors.torch.save_file", fail)
+    with pytest.raises(StorageError, match=r"m\.meso: could not be written \(No space left on device\)"):
+        store.write_model(tmp_path / "m.meso", {"a": torch.ones(1)}, {})
+    assert not list(tmp_path.iterdir())

@@ -1,5 +1,6 @@
 import sys
 
+import numpy as np
 import pytest
 import torch
 
@@ -36,4 +37,16 @@ def test_refusals(monkeypatch):
         unwrap(ball.vertices, ball.faces, tile_size=0)
     monkeypatch.setitem(sys.modules, "xatlas", None)
     with pytest.raises(GeometryError, match=r"install the extra: torchmeso\[mesh\]"):
+        unwrap(ball.vertices, ball.faces, tile_size=1)
+
+
+@pytest.mark.errors
+def test_triangles_that_come_back_in_another_number(monkeypatch):
+    ball = shapes.sphere(triangles=100)
+
+    def lose(vertices, faces):
+        return np.arange(len(vertices)), faces[1:], np.zeros((len(vertices), 2))
+
+    monkeypatch.setattr(pytest.importorskip("xatlas"), "parametrize", lose)
+    with pytest.raises(GeometryError, match="triangles back, got"):
         unwrap(ball.vertices, ball.faces, tile_size=1)
