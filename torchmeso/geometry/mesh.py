@@ -105,15 +105,16 @@ def read_arrays(path: str | Path) -> tuple[Float[Tensor, "V 3"], Int[Tensor, "F 
         raise FormatError(f"{path}: expected a mesh file, found none; check the path")
     try:
         loaded = trimesh.load(path, process=False)
+        parts = list(loaded.dump()) if isinstance(loaded, trimesh.Scene) else [loaded]
+        uvs_of = {id(part): getattr(getattr(part, "visual", None), "uv", None) for part in parts}  # may decode textures
     except Exception as error:  # trimesh raises whatever its many readers raise
         raise FormatError(f"{path}: trimesh could not read it ({type(error).__name__}: {error})") from error
-    parts = list(loaded.dump()) if isinstance(loaded, trimesh.Scene) else [loaded]
     parts = [part for part in parts if isinstance(part, trimesh.Trimesh) and len(part.faces)]
     if not parts:
         raise GeometryError(f"{path.name}: expected triangles, got none")
     for part in parts:
         check_shape(f"{path.name}: vertices", part.vertices, (-1, 3))
-    uvs = [getattr(part.visual, "uv", None) for part in parts]
+    uvs = [uvs_of[id(part)] for part in parts]
     first = np.cumsum([0, *(len(part.vertices) for part in parts)])
     vertices = torch.from_numpy(np.concatenate([part.vertices for part in parts]).astype(np.float64))
     faces = torch.from_numpy(
