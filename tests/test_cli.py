@@ -108,6 +108,7 @@ REFUSED = [
     (["render", "none.yaml", "--out", "x.png"], "expected a configuration (.yaml), found none"),
     (["render", "small.yaml", "--out", "x.gif"], "expected a name that ends in .png or .exr"),
     (["render", "small.yaml", "--out", "small.yaml.png"], "exists already; give --force"),
+    (["render", "small.yaml", "--frames", "2", "--truth", "--out", "x.gif"], "--truth makes one picture"),
     (["compare", "none.png", "none.png"], "expected a picture, found none"),
 ]
 
@@ -192,3 +193,12 @@ def test_export_says_what_it_writes(tmp_path):
     result = run("export", "a.obj", "--to", "a.fbx")
     assert result.exit_code == 2
     assert "expected a name that ends in .glb" in result.stderr
+
+
+@pytest.mark.errors
+def test_the_package_has_its_stages_only():
+    import torchmeso
+
+    assert torchmeso.render.__name__ == "torchmeso.render"
+    with pytest.raises(AttributeError, match="module 'torchmeso' has no attribute 'studios'"):
+        torchmeso.studios  # noqa: B018

@@ -2,10 +2,11 @@ from pathlib import Path
 
 import pytest
 import torch
+import yaml
 
 from torchmeso import config
-from torchmeso.config import CameraConfig, ObjectConfig, parse
-from torchmeso.errors import ConfigError, FormatError
+from torchmeso.config import CameraConfig, ObjectConfig, load, parse
+from torchmeso.errors import ConfigError, FormatError, MesoError
 from torchmeso.geometry.light import DirectionalLight, PointLight, SpotLight
 from torchmeso.geometry.mesh_file import Finish
 
@@ -65,16 +66,17 @@ def test_mesostructure_takes_its_generators_arguments():
 
 def test_objects_are_scaled_then_turned_then_moved():
     item = ObjectConfig(shape="sphere", material="x", scale=2, rotate_deg=(0, 90, 0), translate=(1, 0, 0))
-    moved = item.matrix() @ torch.tensor([1.0, 0, 0, 1])
-    torch.testing.assert_close(moved, torch.tensor([1.0, 0, -2, 1]), rtol=0, atol=1e-6)
+    moved = item.matrix() @ torch.tensor([1.0, 0, 0, 1], dtype=torch.float64)
+    torch.testing.assert_close(moved, torch.tensor([1.0, 0, -2, 1], dtype=torch.float64), rtol=0, atol=1e-6)
 
 
 def test_instances_stand_behind_the_objects_own_place():
     instances = [{"translate": (0, 5, 0)}, {"rotate_deg": (0, 90, 0), "scale": 3}]
     item = ObjectConfig(shape="sphere", material="x", scale=2, translate=(1, 0, 0), instances=instances)
     first, second = item.places()
-    torch.testing.assert_close(first @ torch.tensor([1.0, 0, 0, 1]), torch.tensor([3.0, 5, 0, 1]), rtol=0, atol=1e-6)
-    torch.testing.assert_close(second @ torch.tensor([1.0, 0, 0, 1]), torch.tensor([0.0, 0, -9, 1]), rtol=0, atol=1e-5)
+    point, exact = torch.tensor([1.0, 0, 0, 1], dtype=torch.float64), {"rtol": 0, "atol": 1e-12}
+    torch.testing.assert_close(first @ point, torch.tensor([3.0, 5, 0, 1], dtype=torch.float64), **exact)
+    torch.testing.assert_close(second @ point, torch.tensor([0.0, 0, -9, 1], dtype=torch.float64), **exact)
     assert len(ObjectConfig(shape="sphere", material="x").places()) == 1
 
 
@@ -188,3 +190,18 @@ def test_options_of_the_wrong_kind():
     item = ObjectConfig.model_validate({"shape": "plane", "options": {"size": "big"}, "material": "x"})
     with pytest.raises(ConfigError, match=r"objects\.options\.size: .*got 'big'"):
         item.build_shape()
+
+
+@pytest.mark.errors
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [("a: 2026-13-45", "expected YAML"), ("[" * 5000, "expected YAML"), ("a: " + "9" * 5000, "expected YAML"),
+     ("a: &x [*x]", "a section that holds itself"), (".nan", "camera.eye.0: input should be a finite number"),
+     (".inf", "finite number")],
+)  # fmt: skip
+def test_text_that_is_no_configuration(text, message, tmp_path):
+    if text.startswith("."):
+        text = yaml.safe_dump(minimal(camera={"eye": [float(text[1:]), 0, 1]}))
+    (tmp_path / "a.yaml").write_text(text)
+    with pytest.raises(MesoError, match=message):
+        load(tmp_path / "a.yaml")

@@ -32,3 +32,12 @@ def test_human_size(size, text):
 def test_nearest_name_is_offered():
     assert errors.did_you_mean("ranks", ["rank", "storage"]) == "; did you mean 'rank'?"
     assert "known: rank, storage" in errors.did_you_mean("xyz", ["rank", "storage"])
+
+
+@pytest.mark.errors
+def test_values_that_are_not_finite_are_counted():
+    errors.check_finite("x", torch.ones(3), 0, 1)
+    with pytest.raises(errors.ShapeError, match=r"x: expected finite values, got nan at \(1, 0\) and 1 more of 6"):
+        errors.check_finite("x", torch.tensor([[0.0, 1, 2], [float("nan"), 3, float("inf")]]))
+    with pytest.raises(errors.ShapeError, match=r"x: expected finite values from 0 to 1, got 2$"):
+        errors.check_finite("x", torch.tensor([0.0, 2]), 0, 1)

@@ -42,7 +42,7 @@ Vector = tuple[float, float, float]
 class _Strict(BaseModel):
     """Frozen, and nothing but the known keys."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True, allow_inf_nan=False)
 
 
 def _from_pictures(
@@ -193,7 +193,7 @@ class PlaceConfig(_Strict):
             turn[j, i], turn[i, j] = a.sin(), -a.sin()
             result = turn @ result
         result[:3, 3] = torch.tensor(self.translate, dtype=torch.float64)
-        return result.float()
+        return result
 
 
 class ObjectConfig(PlaceConfig):
@@ -260,7 +260,7 @@ class ObjectConfig(PlaceConfig):
     def places(self) -> list[torch.Tensor]:
         """Return the 4 x 4 matrix of every place it stands at."""
         own = self.matrix()
-        return [(place.matrix().double() @ own.double()).float() for place in self.instances] or [own]
+        return [(place.matrix().double() @ own.double()) for place in self.instances] or [own]
 
 
 class DirectionalConfig(_Strict):
@@ -287,7 +287,8 @@ class PointConfig(_Strict):
 
     def build(self) -> Light:
         """Return the light."""
-        return PointLight(position=torch.tensor(self.position), intensity=torch.tensor(self.intensity))
+        position = torch.tensor(self.position, dtype=torch.float64)
+        return PointLight(position=position, intensity=torch.tensor(self.intensity))
 
 
 class SpotConfig(_Strict):
@@ -302,11 +303,12 @@ class SpotConfig(_Strict):
 
     def build(self) -> Light:
         """Return the light."""
-        axis = torch.tensor(self.at, dtype=torch.float32) - torch.tensor(self.position)
+        position = torch.tensor(self.position, dtype=torch.float64)
+        axis = (torch.tensor(self.at, dtype=torch.float64) - position).float()
         if float(axis.norm()) == 0:
             raise ConfigError("lights.at: expected another place than the light's position")
         return SpotLight(
-            position=torch.tensor(self.position),
+            position=position,
             axis=axis / axis.norm(),
             intensity=torch.tensor(self.intensity),
             inner_deg=self.inner_deg,
@@ -385,7 +387,7 @@ def load(path: str | Path) -> Config:
         raise FormatError(f"{path}: expected a configuration (.yaml), found none; check the path")
     try:
         content = yaml.safe_load(path.read_text())
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # of dates, of numbers, of text, of nesting
         raise FormatError(f"{path}: expected YAML ({' '.join(str(error).split())})") from error
     if not isinstance(content, dict):
         raise FormatError(f"{path}: expected keys and values, got {type(content).__name__}")
@@ -400,6 +402,8 @@ def parse(content: dict[str, Any], *, folder: Path, name: str = "config") -> Con
     """
     try:
         return Config.model_validate(_resolve(content, folder))
+    except RecursionError as error:
+        raise ConfigError(f"{name}: expected keys and values, got a section that holds itself") from error
     except ValidationError as error:
         raise ConfigError(f"{name}: {_first_problem(error)}") from error
 

@@ -5,6 +5,7 @@ only: where a container is made, where a file is read, and at public operations.
 """
 
 import difflib
+import math
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -19,6 +20,10 @@ class ShapeError(MesoError, ValueError):
 
 class FormatError(MesoError, ValueError):
     """A file is missing, or is not what its name or header says."""
+
+
+class StorageError(MesoError, OSError):
+    """A file cannot be written: the disk is full, or the place cannot be written to."""
 
 
 class ConfigError(MesoError, ValueError):
@@ -48,7 +53,19 @@ def check_shape(name: str, x: Any, expected: Sequence[int]) -> None:
 def check_range(name: str, value: float, low: float, high: float) -> None:
     """Raise ConfigError unless low <= value <= high."""
     if not low <= value <= high:
-        raise ConfigError(f"{name}: expected a value from {low:g} to {high:g}, got {value:g}")
+        got = f"{value:g}" if abs(value) < 1e300 else f"{value!s:.12}"  # a whole number may be beyond all floats
+        raise ConfigError(f"{name}: expected a value from {low:g} to {high:g}, got {got}")
+
+
+def check_finite(name: str, x: Any, low: float = -math.inf, high: float = math.inf) -> None:
+    """Raise ShapeError unless every value of the tensor `x` is finite and from `low` to `high`; count the others."""
+    wrong = ~(x.isfinite() & (x >= low) & (x <= high))
+    count = int(wrong.sum())
+    if count:
+        bounds = "" if math.isinf(high) else f" from {low:g} to {high:g}"
+        first = tuple(wrong.nonzero()[0].tolist())
+        more = f" at {first} and {count - 1} more of {x.numel()}" if count > 1 else ""
+        raise ShapeError(f"{name}: expected finite values{bounds}, got {float(x[first]):g}{more}")
 
 
 def check_memory(name: str, needed: float, limit: float, remedy: str) -> None:

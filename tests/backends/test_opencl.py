@@ -114,3 +114,9 @@ def test_a_call_keeps_its_time(device):
     opencl.read([])
     assert call.milliseconds > 0
     assert (y == 3).all()
+
+
+@pytest.mark.errors
+def test_no_room_on_the_device(device):
+    with pytest.raises(BackendError, match=r"opencl: no room for a buffer of .* TiB"):
+        opencl.allocate(1 << 50)

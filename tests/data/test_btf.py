@@ -101,5 +101,37 @@ def test_bad_tables_are_refused(tmp_path, rng):
     btf_module.save(random_btf(rng), tmp_path / "a.btf.zarr")
     meta = tmp_path / "a.btf.zarr" / "zarr.json"
     meta.write_text(meta.read_text().replace('"lights"', '"was_lights"'))
-    with pytest.raises(FormatError, match="expected 'lights' in the table"):
+    with pytest.raises(FormatError, match="expected 'lights' in the file"):
         btf_module.load(tmp_path / "a.btf.zarr")
+
+
+@pytest.mark.errors
+def test_values_that_are_no_reflectance_are_counted(tmp_path, rng):
+    images = torch.zeros(12, 6, 4, 4, 3)
+    images[3, 2, 3] = math.inf
+    table = Btf(images=images, lights=LIGHTS, views=VIEWS)
+    with pytest.raises(
+        ShapeError, match="got inf at light 3, view 2, row 3, column 0, and 11 more in rows 0 to 3; repair"
+    ):
+        table.rows(0, 4)
+    with pytest.raises(ShapeError, match=r"btf\.images: expected finite values, got inf .* 11 more"):
+        table.pictures()
+    with pytest.raises(ShapeError, match="expected at least one texel, got 4 x 0"):
+        Btf(images=images[:, :, :0], lights=LIGHTS, views=VIEWS)
+
+
+@pytest.mark.errors
+def test_damage_on_disk_is_named(tmp_path, rng):
+    path = tmp_path / "a.btf.zarr"
+    btf_module.save(random_btf(rng), path)
+    table = btf_module.load(path)
+    for chunk in (path / "images" / "c").rglob("*"):
+        if chunk.is_file():
+            chunk.write_bytes(chunk.read_bytes()[:9])
+    for read in (table.pictures, lambda: table.rows(0, 1)):
+        with pytest.raises(FormatError, match="the copy may be incomplete"):
+            read()
+    meta = path / "images" / "zarr.json"
+    meta.write_text('{"zarr_format": 3, "node_type": "group"}')
+    with pytest.raises(FormatError, match="expected an array 'images', got a group"):
+        btf_module.load(path)

@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -140,6 +141,13 @@ def test_bad_models_are_refused(tmp_path, rng):
     store.write_model(tmp_path / "a.meso", {"x": torch.ones(1)}, {"kind": "other"})
     with pytest.raises(FormatError, match="expected an eigen BTF, found x"):
         eigen_btf.load(tmp_path / "a.meso")
+    with pytest.raises(ShapeError, match="expected at least one component and texel"):
+        replace(eigen, maps=eigen.maps[:, :0])
+    with pytest.raises(ShapeError, match=r"eigen\.weights: expected finite values, got nan"):
+        replace(eigen, weights=eigen.weights * math.nan)
+    eigen_btf.save(eigen, tmp_path / "b.meso")
+    with pytest.raises(FormatError, match="expected at least one component, got 0"):
+        eigen_btf.load(tmp_path / "b.meso", rank=0)
 
 
 def test_seen_from_afar_a_texture_is_its_mean(rng):

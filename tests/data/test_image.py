@@ -4,7 +4,7 @@ import torch
 from PIL import Image
 
 from torchmeso.data import image
-from torchmeso.errors import FormatError
+from torchmeso.errors import FormatError, StorageError
 
 
 def test_png_round_trip_is_within_half_a_code(tmp_path, rng):
@@ -55,3 +55,14 @@ def test_missing_and_damaged_pictures_say_so(tmp_path):
     (tmp_path / "bad.exr").write_bytes(b"1234")
     with pytest.raises(FormatError, match="expected an OpenEXR"):
         image.read(tmp_path / "bad.exr")
+
+
+@pytest.mark.errors
+def test_an_exr_that_cannot_be_written(tmp_path, monkeypatch):
+    def fail(*_):
+        raise RuntimeError("File too large.")
+
+    monkeypatch.setattr("OpenEXR.File.write", fail)
+    with pytest.raises(StorageError, match=r"a\.exr: could not be written \(File too large\.\)"):
+        image.write_exr(tmp_path / "a.exr", torch.zeros(2, 2, 3))
+    assert not list(tmp_path.iterdir())

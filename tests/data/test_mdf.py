@@ -115,5 +115,9 @@ def test_mismatched_parts_are_refused(tmp_path, rng):
     mdf_module.save(make(rng), tmp_path / "a.mdf.zarr")
     meta = tmp_path / "a.mdf.zarr" / "zarr.json"
     meta.write_text(meta.read_text().replace('"directions"', '"was_directions"'))
-    with pytest.raises(FormatError, match="expected the attribute 'directions'"):
+    with pytest.raises(FormatError, match="expected 'directions' in the file"):
         mdf_module.load(tmp_path / "a.mdf.zarr")
+    with pytest.raises(ShapeError, match="expected at least one texel, got 0 x 2"):
+        Mdf(delta=torch.zeros(20, 2, 0), no_hit=None, directions=VIEWS, h=0.1)
+    with pytest.raises(ShapeError, match=r"mdf\.delta: expected finite values from 0 to 1, got 2"):
+        Mdf(delta=torch.full((20, 2, 2), 2.0), no_hit=None, directions=VIEWS, h=0.1)

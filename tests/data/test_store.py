@@ -1,11 +1,17 @@
+import errno
 import json
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 import torch
+from safetensors import SafetensorError
 from safetensors.torch import save_file
 
 from torchmeso.data import store
-from torchmeso.errors import FormatError
+from torchmeso.errors import FormatError, StorageError
 
 
 def spec(dtype="float32"):
@@ -128,3 +134,109 @@ def test_missing_and_foreign_models_say_so(tmp_path):
     store.write_model(tmp_path / "m.meso", {"a": torch.ones(1)}, {})
     with pytest.raises(FormatError, match="expected a tensor 'b', found none"):
         store.Model(tmp_path / "m.meso").read("b")
+
+
+def test_a_run_killed_once_the_table_had_its_name_leaves_nothing_to_resume(tmp_path):
+    """What is left then are marks of blocks without the table; they must not make an empty table of the next run."""
+    fill(tmp_path / "a.zarr", range(4)).finish()
+    fill(tmp_path / "b.zarr", range(4))
+    part = tmp_path / "a.zarr.part"
+    (tmp_path / "b.zarr.part").rename(part)
+    os.rename(part / "table", tmp_path / "table")
+    writer = store.open_blocks(tmp_path / "a.zarr", spec(), {"kind": "toy"})
+    assert not any(writer.is_done(b) for b in range(4))
+
+
+def test_a_run_killed_while_tables_changed_places(tmp_path):
+    fill(tmp_path / "a.zarr", range(4)).finish()
+    os.rename(tmp_path / "a.zarr", tmp_path / "a.zarr.old.part")
+    fill(tmp_path / "a.zarr", range(4)).finish()
+    assert [p.name for p in tmp_path.iterdir()] == ["a.zarr"]
+    fill(tmp_path / "a.zarr.old.part" / "x", [])
+    fill(tmp_path / "a.zarr", range(4)).finish()
+    assert [p.name for p in tmp_path.iterdir()] == ["a.zarr"]
+
+
+def test_chunks_that_a_killed_run_was_writing_are_not_kept(tmp_path):
+    writer = fill(tmp_path / "a.zarr", range(4))
+    (tmp_path / "a.zarr.part" / "table" / "x" / "0.abc.partial").write_bytes(b"half")
+    writer.finish()
+    assert not list((tmp_path / "a.zarr").rglob("*.partial"))
+
+
+def test_what_a_killed_process_left_is_removed(tmp_path):
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    for process in (gone.pid, os.getppid(), "word", 10**30):
+        (tmp_path / f"out.{process}.part.txt").write_text("half")
+    with store.replacing(tmp_path / "out.txt") as beside:
+        beside.write_text("whole")
+    left = {p.name for p in tmp_path.iterdir()}
+    assert left == {"out.txt", *(f"out.{process}.part.txt" for process in (os.getppid(), "word", 10**30))}
+
+
+def full(*_, **__):
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+@pytest.mark.errors
+def test_a_full_disk_is_one_sentence(tmp_path, monkeypatch):
+    def write():
+        with store.replacing(tmp_path / "a.txt") as beside:
+            beside.write_text("half")
+            full()
+
+    with pytest.raises(StorageError, match=r"a\.txt: could not be written \(No space left on device\); make room"):
+        write()
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(StorageError, match=r"made/a\.txt"), store.writing("made/a.txt"), store.writing("b"):
+        raise StorageError("made/a.txt: as it was said first")
+    with pytest.raises(FileNotFoundError), store.writing("a"):  # no matter of writing
+        Path("none").read_text()
+    monkeypatch.setattr("zarr.storage._local._put", full)
+    with pytest.raises(StorageError, match=r"a\.zarr: could not be written"):
+        fill(tmp_path / "a.zarr", range(4))
+
+
+@pytest.mark.errors
+def test_a_place_that_cannot_be_written_to(tmp_path):
+    (tmp_path / "file").write_text("no folder")
+    for name in ("a.meso", "a.zarr"):
+        with pytest.raises(StorageError, match="could not be written"):
+            if name == "a.zarr":
+                fill(tmp_path / "file" / name, range(4))
+            else:
+                store.write_model(tmp_path / "file" / name, {"a": torch.ones(1)}, {})
+
+
+@pytest.mark.errors
+def test_damage_is_named(tmp_path):
+    def read(error):
+        with store.reading("a.meso"):
+            raise error
+
+    with pytest.raises(FormatError, match=r"a\.meso: expected 'h' in the file, found none"):
+        read(KeyError("h"))
+    with pytest.raises(FormatError, match=r"a.meso: cannot be read \(TypeError: no number\)"):
+        read(TypeError("no number"))
+    with pytest.raises(StorageError, match="ours"):
+        read(StorageError("ours"))
+    save_file({"a": torch.ones(1)}, str(tmp_path / "bad.meso"), {"torchmeso": "{not json"})
+    with pytest.raises(FormatError, match=r"bad.meso: cannot be read \(JSONDecodeError"):
+        store.Model(tmp_path / "bad.meso")
+    fill(tmp_path / "c.zarr", range(4)).finish()
+    meta = tmp_path / "c.zarr" / "zarr.json"
+    meta.write_text(meta.read_text().replace('"format": 1', '"format": "one"'))
+    with pytest.raises(FormatError, match="expected a format number, got 'one'"):
+        store.open_table(tmp_path / "c.zarr", "toy")
+
+
+@pytest.mark.errors
+def test_a_model_that_cannot_be_written(tmp_path, monkeypatch):
+    def fail(*_, **__):
+        raise SafetensorError("No space left on device")
+
+    monkeypatch.setattr("safetensors.torch.save_file", fail)
+    with pytest.raises(StorageError, match=r"m\.meso: could not be written \(No space left on device\)"):
+        store.write_model(tmp_path / "m.meso", {"a": torch.ones(1)}, {})
+    assert not list(tmp_path.iterdir())

@@ -3,7 +3,7 @@ import pytest
 from PIL import Image
 
 from torchmeso.data import video
-from torchmeso.errors import ConfigError
+from torchmeso.errors import ConfigError, StorageError
 
 COLOURS = ((255, 0, 0), (0, 255, 0), (0, 0, 255))
 
@@ -64,3 +64,49 @@ def test_other_suffixes(tmp_path):
         video.record(tmp_path / "empty.gif", fps=10, count=0),
     ):
         pass
+
+
+def add(reel, colour):
+    reel.add(np.full((4, 4, 3), colour, np.uint8))
+
+
+def test_a_sequence_that_was_cut_off_goes_on(tmp_path):
+    def first(job):
+        with video.record(tmp_path / "a.png", fps=1, count=3, job=job) as reel:
+            assert not reel.skip()
+            add(reel, COLOURS[0])
+            raise KeyboardInterrupt
+
+    for job in ("another", "this"):
+        with pytest.raises(KeyboardInterrupt):
+            first(job)
+    assert [p.name for p in tmp_path.iterdir()] == ["a.png.part"]
+    with video.record(tmp_path / "a.png", fps=1, count=3, job="this") as reel:
+        assert [reel.skip(), reel.skip()] == [True, False]
+        add(reel, COLOURS[1])
+        assert not reel.skip()
+        add(reel, COLOURS[2])
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a_0001.png", "a_0002.png", "a_0003.png"]
+
+
+@pytest.mark.parametrize("suffix", ["gif", "mp4"])
+def test_films_do_not_go_on(suffix, tmp_path):
+    if suffix == "mp4":
+        pytest.importorskip("cv2", reason="the extra `video` is not installed")
+    with video.record(tmp_path / f"a.{suffix}", fps=1, count=1) as reel:
+        assert not reel.skip()
+        reel.add(np.zeros((32, 32, 3), np.uint8))
+
+
+@pytest.mark.errors
+def test_a_film_that_lost_frames_is_not_kept(tmp_path):
+    pytest.importorskip("cv2", reason="the extra `video` is not installed")
+
+    def lose():
+        with video.record(tmp_path / "a.mp4", fps=1, count=2) as reel:
+            reel.add(np.zeros((32, 32, 3), np.uint8))
+            reel._count += 1  # OpenCV does not say that a frame was not written
+
+    with pytest.raises(StorageError, match=r"a\.mp4: could not be written \(of 2 frames 1 are in the film\)"):
+        lose()
+    assert list(tmp_path.iterdir()) == []

@@ -73,3 +73,22 @@ def test_built_in_shapes_are_one_closed_part():
     for name in ("cylinder", "sphere", "torus", "torus_knot"):
         mesh = shapes.SHAPES[name]()
         assert mesh.closed.tolist() == [True], name
+
+
+def test_sheets_with_two_sides_keep_one():
+    """A body drawn twice, back to back, and one of two bodies that touch."""
+    v, f = tetrahedron()
+    doubled = torch.cat([f, f.roll(1, 1).flip(1)])
+    found = components.find(v, doubled)
+    assert components.twins(found, v, doubled).tolist() == [False] * 4 + [True] * 4
+    assert not components.twins(components.find(v, f), v, f).any()
+    apex = torch.cat([v, torch.tensor([[-1.0, -1, -1]])])
+    touching = torch.cat([f, torch.tensor([[1, 2, 3]]).flip(1), torch.tensor([[1, 2, 4], [2, 3, 4], [3, 1, 4]])])
+    found = components.find(apex, touching)
+    assert len(found.closed) == 1
+    assert not components.twins(found, apex, touching).any()
+
+
+def test_nothing_has_no_twins():
+    v, f = torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.long)
+    assert components.twins(components.find(v, f), v, f).tolist() == []

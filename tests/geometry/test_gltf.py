@@ -113,12 +113,12 @@ def test_nodes_place_meshes_and_mirrors_keep_the_outside_outside(tmp_path):
         {"mesh": 0, "rotation": [0, half, 0, half], "scale": [-2, 2, 2]},  # a quarter turn around y, mirrored in x
     ]
     found = mesh_file.read(write(tmp_path / "a.gltf", document(nodes=nodes)))
-    torch.testing.assert_close(found.vertices[2], torch.tensor([0.0, 2.0, 7.0]), rtol=0, atol=1e-6)
+    torch.testing.assert_close(found.vertices[2].float(), torch.tensor([0.0, 2.0, 7.0]), rtol=0, atol=1e-6)
     a, b, c = found.vertices[found.faces[0]]
     assert found.normals is not None
     assert found.tangents is not None
     facing = torch.linalg.cross(b - a, c - a)
-    torch.testing.assert_close(facing / facing.norm(), found.normals[0], rtol=0, atol=1e-6)
+    torch.testing.assert_close((facing / facing.norm()).float(), found.normals[0], rtol=0, atol=1e-6)
     body = mesh.dress_file(found)
     # Mirrored in the world: t along +u, b along +v, and a left-handed frame.
     torch.testing.assert_close(body.tangents[0], torch.tensor([0.0, 0.0, 1.0]), rtol=0, atol=1e-6)

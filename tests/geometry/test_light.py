@@ -49,4 +49,11 @@ def test_malformed_lights_are_refused():
     with pytest.raises(ShapeError, match=r"light.direction: expected shape \(3\)"):
         DirectionalLight(direction=torch.zeros(2), irradiance=WHITE)
     with pytest.raises(ConfigError, match="inner_deg: expected a value from 0 to 30"):
-        SpotLight(position=torch.zeros(3), axis=WHITE, intensity=WHITE, inner_deg=40, outer_deg=30)
+        SpotLight(position=torch.zeros(3), axis=WHITE / 3**0.5, intensity=WHITE, inner_deg=40, outer_deg=30)
+    up = torch.tensor([0.0, 1.0, 0.0])
+    with pytest.raises(ShapeError, match=r"light.direction \(its length\): expected finite values from 0.999 to 1.001"):
+        DirectionalLight(direction=up * 0, irradiance=WHITE)
+    with pytest.raises(ShapeError, match=r"light.irradiance: .* from 0 to 1e\+20, got nan at \(0,\) and 2 more of 3"):
+        DirectionalLight(direction=up, irradiance=WHITE * math.nan)
+    with pytest.raises(ShapeError, match=r"light\.intensity: expected finite values from 0"):
+        PointLight(position=up, intensity=-WHITE)

@@ -144,3 +144,51 @@ def test_arrays_that_cannot_be_dressed_say_why():
     with pytest.raises(ShapeError, match=r"mesh\.uv: expected shape \(4, 2\), got \(3, 2\)"):
         Mesh(**{**fields, "uv": square.uv[:3]})
     assert mesh_module.CREASE_DEG == 60
+
+
+def test_texture_coordinates_far_from_zero_are_moved_by_whole_tiles():
+    near = dress(QUAD, QUAD_FACES, QUAD_UV)
+    assert torch.equal(dress(QUAD, QUAD_FACES, QUAD_UV + torch.tensor([1024.0, -4096.0])).uv, near.uv)
+    assert torch.equal(dress(QUAD, QUAD_FACES, QUAD_UV + 3).uv, near.uv + 3)  # a few tiles are no matter
+
+
+def test_positions_far_from_the_origin_stay_sharp():
+    matrix = torch.eye(4, dtype=torch.float64)
+    matrix[0, 3] = 1e6
+    far = transform(dress(QUAD * 0.1, QUAD_FACES, QUAD_UV), matrix)
+    assert far.vertices.dtype == torch.float64
+    assert far.normals.dtype == torch.float32
+    torch.testing.assert_close(far.vertices[:, 0] - 1e6, QUAD[:, 0].double() * 0.1, rtol=0, atol=1e-8)
+    matrix[0, 3] = 1.0
+    assert transform(dress(QUAD, QUAD_FACES, QUAD_UV), matrix).vertices.dtype == torch.float32
+
+
+def test_files_far_from_the_origin_stay_sharp(tmp_path):
+    lines = [f"v {x + 1e6:.4f} {y:.4f} {z:.4f}" for x, y, z in (QUAD * 0.1).tolist()]
+    lines += [f"vt {u} {v}" for u, v in QUAD_UV.tolist()] + ["f 1/1 2/2 3/3", "f 1/1 3/3 4/4"]
+    (tmp_path / "far.obj").write_text("\n".join(lines))
+    far = load(tmp_path / "far.obj")
+    assert far.vertices.dtype == torch.float64
+    assert far.normals.dtype == torch.float32
+    assert (far.vertices[:, 0] - 1e6).abs().max() == pytest.approx(0.1, abs=1e-6)
+
+
+def test_a_sheet_with_two_sides_keeps_one():
+    both = torch.cat([QUAD_FACES, QUAD_FACES.flip(1)])
+    with pytest.warns(UserWarning, match="2 faces lay back to back on others and were left out"):
+        assert len(dress(QUAD, both, QUAD_UV).faces) == 2
+
+
+@pytest.mark.errors
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [({"faces": QUAD_FACES + 9}, "expected vertex numbers from 0 to 3, got 9 to 12"),
+     ({"faces": QUAD_FACES - 1}, "got -1 to 2"),
+     ({"faces": QUAD_FACES[:0]}, "expected triangles, got none"),
+     ({"vertices": QUAD * 1e20}, r"expected positions within 1e\+15 of the origin"),
+     ({"uv": QUAD_UV * 1e9}, r"expected texture coordinates over at most 100000 tiles, got 1e\+09")],
+)  # fmt: skip
+def test_arrays_nothing_can_be_made_of(change, message):
+    arrays = {"vertices": QUAD, "faces": QUAD_FACES, "uv": QUAD_UV, **change}
+    with pytest.raises(GeometryError, match=message):
+        dress(**arrays)

@@ -3,6 +3,7 @@ import math
 import pytest
 import torch
 
+from torchmeso.errors import ConfigError
 from torchmeso.geometry import components, shapes
 from torchmeso.geometry.directions import dot
 
@@ -57,3 +58,15 @@ def test_triangle_counts_are_near_what_is_asked():
 def test_wrapped_seams_share_positions_bit_for_bit():
     mesh = shapes.torus(triangles=600)
     assert components.weld(mesh.vertices).max() + 1 == 300
+
+
+@pytest.mark.errors
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [(lambda: shapes.plane(size=(1.0, 0.0)), r"shape\.depth"), (lambda: shapes.sphere(radius=-1.0), r"shape\.radius"),
+     (lambda: shapes.cylinder(height=float("nan")), r"shape\.height"), (lambda: shapes.torus(tube=0.0), r"shape\.tube"),
+     (lambda: shapes.torus_knot(p=0), r"shape\.p: expected a value from 1")],
+)  # fmt: skip
+def test_sizes_that_make_no_shape(make, message):
+    with pytest.raises(ConfigError, match=message):
+        make()

@@ -1,5 +1,6 @@
 import sys
 
+import numpy as np
 import pytest
 import torch
 
@@ -76,4 +77,25 @@ def test_refusals(monkeypatch):
         UnwrapOptions(iterations=0)
     monkeypatch.setitem(sys.modules, "xatlas", None)
     with pytest.raises(GeometryError, match=r"install the extra: torchmeso\[mesh\]"):
+        unwrap(ball.vertices, ball.faces, tile_size=1)
+
+
+@pytest.mark.errors
+def test_triangles_that_come_back_in_another_number(monkeypatch):
+    ball = shapes.sphere(triangles=100)
+
+    class Losing:
+        width = height = 1
+
+        def add_mesh(self, vertices, faces):
+            self.vertices, self.faces = vertices, faces
+
+        def generate(self, *_):
+            pass
+
+        def __getitem__(self, _):
+            return np.arange(len(self.vertices)), self.faces[1:], np.zeros((len(self.vertices), 2))
+
+    monkeypatch.setattr(pytest.importorskip("xatlas"), "Atlas", Losing)
+    with pytest.raises(GeometryError, match="triangles back, got"):
         unwrap(ball.vertices, ball.faces, tile_size=1)

@@ -25,7 +25,7 @@ def test_lights_go_around_and_the_camera_rests():
     (first, _), (second, (sun, point, spot)) = list(animate.turn(small(lights=lights), 4, "light"))[:2]
     assert torch.equal(first.eye, second.eye)
     torch.testing.assert_close(sun.direction, torch.tensor([0, 1, -1]) / math.sqrt(2))
-    torch.testing.assert_close(point.position, torch.tensor([0.0, 1, -2]))
+    torch.testing.assert_close(point.position, torch.tensor([0.0, 1, -2], dtype=torch.float64))
     torch.testing.assert_close(spot.axis, torch.tensor([0.0, -1, 1]) / math.sqrt(2), atol=1e-6, rtol=0)
 
 

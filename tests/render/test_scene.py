@@ -5,7 +5,8 @@ from tests.render.scenes import camera, scene, sun
 from tests.tolerances import FLOAT32
 from torchmeso.data.mdf import Mdf
 from torchmeso.errors import ConfigError, ShapeError
-from torchmeso.geometry import hemisphere, shapes
+from torchmeso.geometry import hemisphere, mesh, shapes
+from torchmeso.geometry.light import PointLight
 from torchmeso.meso import generators
 from torchmeso.meso.bake_mdf import RayCastMdf
 from torchmeso.render.rasterize import rasterize
@@ -104,3 +105,38 @@ def test_faces_without_a_material_are_refused():
         Object(mesh=body, material=Material(), part=torch.ones(n, dtype=torch.long))
     with pytest.raises(ShapeError, match=rf"object\.part: expected shape \({n}\), got \(3,\)"):
         Object(mesh=body, material=Material(), part=torch.zeros(3, dtype=torch.long))
+
+
+def far_away(subject, distance):
+    matrix = torch.eye(4, dtype=torch.float64)
+    matrix[0, 3] = matrix[2, 3] = distance
+    return mesh.transform(subject, matrix)
+
+
+def test_a_scene_far_away_has_an_origin_of_its_own():
+    body = shapes.sphere(triangles=200)
+    home, far = assemble(scene(body)), assemble(scene(far_away(body, 1e6)))
+    assert not home.origin.any()
+    assert far.vertices.dtype == torch.float32
+    assert far.origin.tolist() == [1e6, 0, 1e6]
+    torch.testing.assert_close(far.vertices, home.vertices, rtol=0, atol=1e-6)
+
+
+def test_camera_and_lights_come_along():
+    world = assemble(scene(far_away(shapes.sphere(triangles=200), 1e6)))
+    view = camera((1e6, 0, 1e6 + 3), at=(1e6, 0, 1e6))
+    lamp = PointLight(position=torch.tensor([1e6 + 1, 2, 1e6], dtype=torch.float64), intensity=torch.ones(3))
+    light = sun(0, 1, 0)
+    assert world.seen_by(view).eye.tolist() == [0, 0, 3]
+    moved = world.lit_by((lamp, light))
+    assert moved[0].position.tolist() == [1, 2, 0]
+    assert moved[1] is light
+
+
+@pytest.mark.errors
+def test_light_that_is_no_number_is_refused():
+    body = shapes.sphere(triangles=200)
+    with pytest.raises(ConfigError, match=r"scene.ambient: expected a value from 0 to 1e\+20, got nan"):
+        scene(body, ambient=float("nan"))
+    with pytest.raises(ConfigError, match=r"scene\.background"):
+        Scene(objects=scene(body).objects, lights=(), background=(0.0, float("inf"), 0.0))

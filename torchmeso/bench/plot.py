@@ -38,6 +38,9 @@ def draw(rows: Sequence[Row], path: str | Path) -> None:
     for axis, (title, series) in zip(axes.flat, groups.items(), strict=False):
         for name, members in series.items():
             _line(axis, name, members)
+        values = [m.value for members in series.values() for m in members if m.value is not None]
+        if min(values) > 0 and max(values) > 1e3 * min(values):
+            axis.set_yscale("log")
         axis.set_title(title, fontsize=10)
         axis.set_ylabel(next(iter(series.values()))[0].unit)
         axis.grid(alpha=0.3)

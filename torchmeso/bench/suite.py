@@ -116,15 +116,15 @@ def run(measurements: Sequence[Measurement], context: Context, only: Sequence[st
     rows: list[Row] = []
     for m in select(measurements, only):
         context.report(f"bench {m.name}", 0)
-        _peak()
-        found = [replace(row, peak_mb=_peak()) for row in m.run(context)]
+        resident_peak()
+        found = [replace(row, peak_mb=resident_peak()) for row in m.run(context)]
         patterns = [wanted for wanted in only if wanted.startswith(f"{m.name}.")]
         rows += [r for r in found if not patterns or any(_fits(r.id, p) for p in patterns)]
         context.report(f"bench {m.name}", 1)
     return rows
 
 
-def _peak() -> int:
+def resident_peak() -> int:
     """Return the largest resident memory since the last call, in MB; where that is not known, of the whole process."""
     status = Path("/proc/self/status")
     if not status.exists():

@@ -20,9 +20,12 @@ from torch import Tensor
 
 from torchmeso.data import address, store
 from torchmeso.data.pyramid import Footprint
-from torchmeso.errors import FormatError, ShapeError, check_shape
+from torchmeso.errors import FormatError, ShapeError, check_finite, check_shape
 from torchmeso.geometry import hemisphere
 from torchmeso.geometry.hemisphere import DirectionSet
+
+LARGEST = 1e15
+"""Values of T beyond it are damage, not light: their squares would not fit into the float32 sums of a fit."""
 
 
 @runtime_checkable
@@ -65,6 +68,8 @@ class Btf:
     def __post_init__(self) -> None:
         """Raise ShapeError unless the directions match the images."""
         check_shape("btf.images", self.images, (len(self.lights), len(self.views), -1, -1, 3))
+        if min(self.texels) < 1:
+            raise ShapeError(f"btf.images: expected at least one texel, got {self.texels[1]} x {self.texels[0]}")
 
     @property
     def texels(self) -> tuple[int, int]:
@@ -75,25 +80,38 @@ class Btf:
         """Return texel rows start .. stop of all pictures as float32, reading no others.
 
         Raises:
-            ShapeError: a value is not finite (the place is named).
+            FormatError: the file on disk is damaged.
+            ShapeError: a value is not finite, or beyond `LARGEST` (the place is named, the others are counted).
         """
         if isinstance(self.images, Tensor):
             band = self.images[:, :, start:stop].float()
         else:
-            band = torch.from_numpy(np.asarray(self.images[:, :, start:stop])).float()
-        if not bool(torch.isfinite(band).all()):
-            light, view, row, column, _ = (~torch.isfinite(band)).nonzero()[0].tolist()
+            with store.reading(str(self.images.store_path)):
+                band = torch.from_numpy(np.asarray(self.images[:, :, start:stop])).float()
+        wrong = ~((band <= LARGEST) & (band >= -LARGEST))
+        if bool(wrong.any()):
+            light, view, row, column, channel = wrong.nonzero()[0].tolist()
+            value = float(band[light, view, row, column, channel])
             raise ShapeError(
-                f"btf.images: expected finite values, got {float(band[light, view, row, column].sum())} "
-                f"at light {light}, view {view}, row {start + row}, column {column}"
+                f"btf.images: expected finite values up to {LARGEST:g}, got {value:g} at light {light}, view {view}, "
+                f"row {start + row}, column {column}, and {int(wrong.sum()) - 1} more "
+                f"in rows {start} to {start + band.shape[2] - 1}; repair or mask them before fitting"
             )
         return band
 
     def pictures(self) -> Float[Tensor, "light view H W 3"]:
-        """Return all pictures, read into memory, in the dtype they are stored in."""
+        """Return all pictures, read into memory, in the dtype they are stored in.
+
+        Raises:
+            ShapeError: a value is not finite.
+        """
         if isinstance(self.images, Tensor):
-            return self.images
-        return torch.from_numpy(np.asarray(self.images[:]))
+            images = self.images
+        else:
+            with store.reading(str(self.images.store_path)):
+                images = torch.from_numpy(np.asarray(self.images[:]))
+        check_finite("btf.images", images)
+        return images
 
     def evaluate(
         self,
@@ -156,13 +174,12 @@ def load(path: str | Path) -> Btf:
         FormatError: the table is missing, damaged or of another kind.
     """
     group = store.open_table(path, "btf")
-    try:
+    with store.reading(path):
         about, images = store.attributes(group), group["images"]
-        assert isinstance(images, zarr.Array)
+        if not isinstance(images, zarr.Array):
+            raise FormatError(f"{path}: expected an array 'images', got a group; the copy may be incomplete")
         lights, views = hemisphere.parse(about["lights"]), hemisphere.parse(about["views"])
         return Btf(images=images, lights=lights, views=views, h=about["h"])
-    except KeyError as error:
-        raise FormatError(f"{path}: expected {error} in the table, found none; the copy may be incomplete") from error
 
 
 def save(btf: Btf, path: str | Path, *, dtype: str = "float16", **attributes: object) -> None:
@@ -175,9 +192,10 @@ def save(btf: Btf, path: str | Path, *, dtype: str = "float16", **attributes: ob
     if not bool(torch.isfinite(images).all()):
         raise ShapeError(f"btf.images: expected values that fit {dtype}, got one beyond it; store float32")
     attributes = {**table_attributes(btf.lights, btf.views, btf.h), **attributes}
-    writer = store.open_blocks(path, specs(tuple(images.shape), dtype), attributes)
-    writer["images"][:] = images.numpy()
-    writer.finish()
+    with store.writing(path):
+        writer = store.open_blocks(path, specs(tuple(images.shape), dtype), attributes)
+        writer["images"][:] = images.numpy()
+        writer.finish()
 
 
 def specs(shape: tuple[int, ...], dtype: str = "float16") -> dict[str, store.ArraySpec]:

@@ -21,7 +21,7 @@ from torchmeso.data import address, mdf, pyramid, store
 from torchmeso.data.btf import horizon_falloff
 from torchmeso.data.mdf import Mdf
 from torchmeso.data.pyramid import Footprint
-from torchmeso.errors import FormatError, ShapeError, check_shape
+from torchmeso.errors import FormatError, ShapeError, check_finite, check_shape
 from torchmeso.geometry import hemisphere
 from torchmeso.geometry.hemisphere import DirectionSet
 
@@ -55,6 +55,13 @@ class EigenBtf:
         check_shape("eigen.offset", self.offset, (rank, 3))
         if self.maps.dtype != torch.uint8 and not self.maps.is_floating_point():
             raise ShapeError(f"eigen.maps: expected uint8 or a float type, got {self.maps.dtype}")
+        if rank < 1 or min(self.texels) < 1:
+            raise ShapeError(f"eigen.maps: expected at least one component and texel, got {tuple(self.maps.shape)}")
+        floats = {"weights": self.weights, "scale": self.scale, "offset": self.offset}
+        for name, values in (
+            floats.items() if self.maps.dtype == torch.uint8 else (*floats.items(), ("maps", self.maps))
+        ):
+            check_finite(f"eigen.{name}", values)
 
     @property
     def rank(self) -> int:
@@ -187,12 +194,15 @@ def load(path: str | Path, *, rank: int | None = None) -> EigenBtf:
     about = model.meta.get("eigen")
     if about is None:
         raise FormatError(f"{path}: expected an eigen BTF, found {', '.join(model.names()) or 'nothing'}")
-    kept = about["rank"] if rank is None else min(rank, about["rank"])
-    return EigenBtf(
-        maps=torch.stack([model.read(f"eigen.map.{k}") for k in range(kept)], -2),
-        weights=model.read("eigen.weights")[:, :kept],
-        scale=model.read("eigen.scale")[:kept],
-        offset=model.read("eigen.offset")[:kept],
-        lights=hemisphere.parse(about["lights"]),
-        views=hemisphere.parse(about["views"]),
-    )
+    with store.reading(path):
+        kept = about["rank"] if rank is None else min(rank, about["rank"])
+        if kept < 1:
+            raise FormatError(f"{path}: expected at least one component, got {kept}; the copy may be incomplete")
+        return EigenBtf(
+            maps=torch.stack([model.read(f"eigen.map.{k}") for k in range(kept)], -2),
+            weights=model.read("eigen.weights")[:, :kept],
+            scale=model.read("eigen.scale")[:kept],
+            offset=model.read("eigen.offset")[:kept],
+            lights=hemisphere.parse(about["lights"]),
+            views=hemisphere.parse(about["views"]),
+        )

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchmeso.data.store import replacing
-from torchmeso.errors import FormatError
+from torchmeso.errors import FormatError, StorageError
 
 
 def read(path: str | Path | bytes) -> Float[Tensor, "H W 3"]:
@@ -74,7 +74,10 @@ def write_exr(path: str | Path, rgb: Float[Tensor, "H W 3"], **channels: Float[T
     planes |= {name: np.array(x.detach().float().numpy(), order="C", copy=True) for name, x in channels.items()}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with replacing(path) as beside:
-        OpenEXR.File(header, planes).write(str(beside))
+        try:
+            OpenEXR.File(header, planes).write(str(beside))
+        except RuntimeError as error:  # what the binding makes of any failure
+            raise StorageError(f"{path}: could not be written ({error}); make room or choose another place") from error
 
 
 def to_bytes(rgb: Float[Tensor, "H W 3"]) -> np.ndarray:

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from torchmeso.data import address, store
 from torchmeso.data.relief import Relief, from_views
-from torchmeso.errors import FormatError, ShapeError, check_range, check_shape
+from torchmeso.errors import ShapeError, check_finite, check_range, check_shape
 from torchmeso.geometry import hemisphere
 from torchmeso.geometry.hemisphere import DirectionSet
 
@@ -52,6 +52,10 @@ class Mdf:
             raise ShapeError(f"mdf.delta: expected uint8, float16, float32 or float64, got {self.delta.dtype}")
         if self.no_hit is not None:
             check_shape("mdf.no_hit", self.no_hit, tuple(self.delta.shape))
+        if min(self.texels) < 1:
+            raise ShapeError(f"mdf.delta: expected at least one texel, got {self.texels[1]} x {self.texels[0]}")
+        if self.delta.dtype != torch.uint8:
+            check_finite("mdf.delta", self.delta, 0, 1)
         check_range("mdf.h", self.h, 1e-6, 1e3)
 
     @property
@@ -129,14 +133,14 @@ class Mdf:
 
 def save(mdf: Mdf, path: str | Path, **attributes: object) -> None:
     """Write `mdf` as a raw table (.mdf.zarr), whole."""
-    writer = store.open_blocks(
-        path,
-        specs(mdf.delta.shape, str(mdf.delta.dtype).removeprefix("torch.")),
-        {**table_attributes(mdf.directions, mdf.h), **attributes},
-    )
-    writer["delta"][:] = mdf.delta.numpy()
-    writer["no_hit"][:] = (torch.zeros_like(mdf.delta, dtype=torch.bool) if mdf.no_hit is None else mdf.no_hit).numpy()
-    writer.finish()
+    missing = torch.zeros_like(mdf.delta, dtype=torch.bool) if mdf.no_hit is None else mdf.no_hit
+    layout = specs(mdf.delta.shape, str(mdf.delta.dtype).removeprefix("torch."))
+    about = {**table_attributes(mdf.directions, mdf.h), **attributes}
+    with store.writing(path):
+        writer = store.open_blocks(path, layout, about)
+        writer["delta"][:] = mdf.delta.numpy()
+        writer["no_hit"][:] = missing.numpy()
+        writer.finish()
 
 
 def load(path: str | Path) -> Mdf:
@@ -146,18 +150,15 @@ def load(path: str | Path) -> Mdf:
         FormatError: the table is missing, damaged or of another kind.
     """
     group = store.open_table(path, "mdf")
-    no_hit = store.read_array(group, "no_hit")
-    try:
+    with store.reading(path):
         about = store.attributes(group)
-        directions, h = hemisphere.parse(about["directions"]), about["h"]
-    except KeyError as error:
-        raise FormatError(f"{path}: expected the attribute {error}, found none") from error
-    return Mdf(
-        delta=store.read_array(group, "delta"),
-        no_hit=no_hit if bool(no_hit.any()) else None,
-        directions=directions,
-        h=h,
-    )
+        no_hit = store.read_array(group, "no_hit").bool()
+        return Mdf(
+            delta=store.read_array(group, "delta"),
+            no_hit=no_hit if bool(no_hit.any()) else None,
+            directions=hemisphere.parse(about["directions"]),
+            h=about["h"],
+        )
 
 
 def specs(shape: tuple[int, ...], dtype: str) -> dict[str, store.ArraySpec]:
@@ -187,7 +188,7 @@ def from_model(model: store.Model) -> Mdf | None:
     meta = model.meta.get("mdf")
     if meta is None:
         return None
-    no_hit = model.read("mdf.no_hit") if "mdf.no_hit" in model.names() else None
-    return Mdf(
-        delta=model.read("mdf.delta"), no_hit=no_hit, directions=hemisphere.parse(meta["directions"]), h=meta["h"]
-    )
+    with store.reading(model.path):
+        no_hit = model.read("mdf.no_hit") if "mdf.no_hit" in model.names() else None
+        directions = hemisphere.parse(meta["directions"])
+        return Mdf(delta=model.read("mdf.delta"), no_hit=no_hit, directions=directions, h=meta["h"])

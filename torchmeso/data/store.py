@@ -7,6 +7,8 @@ safetensors files, one tensor per component, memory-mapped: what is not asked fo
 Test: tests/data/test_store.py
 """
 
+import errno
+import glob
 import hashlib
 import json
 import os
@@ -23,7 +25,7 @@ import zarr
 from torch import Tensor
 from zarr.codecs import BloscCodec
 
-from torchmeso.errors import FormatError
+from torchmeso.errors import FormatError, MesoError, StorageError
 
 FORMAT_VERSION = 1
 
@@ -68,6 +70,8 @@ class BlockWriter:
 
     def finish(self) -> None:
         """Give the finished table its name."""
+        for scrap in (self._part / "table").rglob("*.partial"):  # of chunks that a killed run was writing
+            scrap.unlink()
         _replace_directory(self._part / "table", self._target)
         shutil.rmtree(self._part)
 
@@ -76,11 +80,19 @@ def open_blocks(path: str | Path, specs: Mapping[str, ArraySpec], attributes: di
     """Return a writer for the raw table `path`, resumed where an earlier run of the same job stopped.
 
     The same job means equal specs and attributes; anything else in `<path>.part` is thrown away.
+
+    Raises:
+        StorageError: the disk is full, or the place cannot be written to.
     """
-    path = Path(path)
+    with writing(path):
+        return _open_blocks(Path(path), specs, attributes)
+
+
+def _open_blocks(path: Path, specs: Mapping[str, ArraySpec], attributes: dict[str, Any]) -> BlockWriter:
     part = path.with_name(path.name + ".part")
     key = content_hash({name: _spec_as_json(spec) for name, spec in specs.items()}, attributes)
-    if part.exists() and _key_of(part) != key:
+    # Without its table it is what a run left that was killed just after the table had its name.
+    if part.exists() and not ((part / "table").is_dir() and _key_of(part) == key):
         shutil.rmtree(part)
     fresh = not part.exists()
     (part / "done").mkdir(parents=True, exist_ok=True)
@@ -119,6 +131,8 @@ def open_table(path: str | Path, kind: str) -> zarr.Group:
             f"{path}: expected a Zarr group ({type(error).__name__}); the copy may be incomplete"
         ) from error
     about = attributes(group)
+    if not isinstance(about.get("format", 0), int):
+        raise FormatError(f"{path}: expected a format number, got '{about['format']}'; the copy may be incomplete")
     if about.get("kind") != kind:
         raise FormatError(f"{path}: expected a {kind} table, got '{about.get('kind', 'something else')}'")
     if about.get("format", 0) > FORMAT_VERSION:
@@ -147,11 +161,15 @@ def read_array(group: zarr.Group, name: str, selection: Any = Ellipsis) -> Tenso
 
 def write_model(path: str | Path, tensors: Mapping[str, Tensor], meta: dict[str, Any]) -> None:
     """Write a run-time model: `tensors` by name, `meta` as JSON."""
+    from safetensors import SafetensorError
     from safetensors.torch import save_file
 
     header = {"torchmeso": json.dumps({**meta, "format": FORMAT_VERSION})}
     with replacing(path) as beside:
-        save_file({name: x.contiguous() for name, x in tensors.items()}, str(beside), metadata=header)
+        try:
+            save_file({name: x.contiguous() for name, x in tensors.items()}, str(beside), metadata=header)
+        except SafetensorError as error:
+            raise StorageError(f"{path}: could not be written ({error}); make room or choose another place") from error
 
 
 class Model:
@@ -177,9 +195,12 @@ class Model:
         header = self._file.metadata() or {}
         if "torchmeso" not in header:
             raise FormatError(f"{path}: expected a model written by torchmeso, got another safetensors file")
-        self.meta: dict[str, Any] = json.loads(header["torchmeso"])
-        if self.meta.get("format", 0) > FORMAT_VERSION:
-            raise FormatError(f"{path}: written by a newer torchmeso (format {self.meta['format']}); update torchmeso")
+        with reading(path):
+            self.meta: dict[str, Any] = dict(json.loads(header["torchmeso"]))
+            if self.meta.get("format", 0) > FORMAT_VERSION:
+                raise FormatError(
+                    f"{path}: written by a newer torchmeso (format {self.meta['format']}); update torchmeso"
+                )
 
     def names(self) -> list[str]:
         """Return the names of all tensors."""
@@ -197,16 +218,64 @@ class Model:
 
 
 @contextmanager
-def replacing(path: str | Path) -> Iterator[Path]:
-    """Yield a file name beside `path` to write to; it takes the name `path` when the block ends without error."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_name(f".{os.getpid()}-{path.name}")
+def reading(path: str | Path) -> Iterator[None]:
+    """Turn whatever goes wrong while a file is decoded into a FormatError that names `path`.
+
+    zarr, numcodecs, JSON and our own code meet damage in many places, and each says it in its own way.
+    """
     try:
-        yield beside
-        os.replace(beside, path)
-    finally:
-        beside.unlink(missing_ok=True)
+        yield
+    except MesoError:
+        raise
+    except KeyError as error:
+        raise FormatError(f"{path}: expected {error} in the file, found none; the copy may be incomplete") from error
+    except Exception as error:
+        what = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
+        raise FormatError(f"{path}: cannot be read ({what}); the copy may be incomplete") from error
+
+
+@contextmanager
+def replacing(path: str | Path) -> Iterator[Path]:
+    """Yield a file name beside `path` to write to; it takes the name `path` when the block ends without error.
+
+    What a killed process left there is removed by the next one that writes `path`.
+
+    Raises:
+        StorageError: the disk is full, or the place cannot be written to.
+    """
+    path = Path(path)
+    beside = path.with_name(f"{path.stem}.{os.getpid()}.part{path.suffix}")
+    with writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        for other in path.parent.glob(f"{glob.escape(path.stem)}.*.part{glob.escape(path.suffix)}"):
+            _remove_if_left(other)
+        try:
+            yield beside
+            os.replace(beside, path)
+        finally:
+            beside.unlink(missing_ok=True)
+
+
+@contextmanager
+def writing(path: str | Path) -> Iterator[None]:
+    """Turn what the system says against writing into a StorageError that names `path`."""
+    try:
+        yield
+    except StorageError:
+        raise
+    except OSError as error:
+        if error.errno not in CANNOT_WRITE:
+            raise
+        raise StorageError(
+            f"{path}: could not be written ({error.strerror}); make room or choose another place"
+        ) from error
+
+
+CANNOT_WRITE = {
+    errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO, errno.ENOTDIR,
+    errno.EISDIR, errno.ENAMETOOLONG, errno.EEXIST,
+}  # fmt: skip
+"""What the system says where a file cannot be written."""
 
 
 def content_hash(*parts: Any) -> str:
@@ -222,12 +291,27 @@ def cache_dir() -> Path:
 
 def _replace_directory(source: Path, target: Path) -> None:
     """Rename a folder over another one; the old one is only removed once the new one has its name."""
-    old = target.with_name(f".old-{os.getpid()}-{target.name}")
+    old = target.with_name(f"{target.name}.old.part")
     if target.exists():
+        if old.exists():  # of a run that was killed
+            shutil.rmtree(old)
         os.replace(target, old)
     os.replace(source, target)
     if old.exists():
         shutil.rmtree(old)
+
+
+def _remove_if_left(beside: Path) -> None:
+    """Remove a file that a process was writing which runs no more."""
+    process = beside.name.removesuffix(f".part{beside.suffix}").rpartition(".")[2]
+    if not process.isdecimal():
+        return
+    try:
+        os.kill(int(process), 0)
+    except ProcessLookupError:
+        beside.unlink(missing_ok=True)
+    except (OSError, OverflowError):
+        return  # another's, or no process at all
 
 
 def _array(group: zarr.Group, name: str) -> zarr.Array:

@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchmeso.errors import ConfigError, check_range, check_shape
+from torchmeso.errors import ConfigError, check_finite, check_range, check_shape
 from torchmeso.geometry.directions import normalize
 
 Projection = Literal["perspective", "orthographic"]
@@ -55,8 +55,12 @@ class Camera:
         check_range("camera.width", self.width, 1, 16384)
         check_range("camera.height", self.height, 1, 16384)
         check_range("camera.fov_deg", self.fov_deg, 1e-3, 175)
-        if self.near <= 0 or self.view_height <= 0:
-            raise ConfigError(f"camera: expected near and view_height > 0, got {self.near:g}, {self.view_height:g}")
+        check_finite("camera.eye", self.eye)
+        check_finite("camera.axes", self.axes)
+        if not (0 < self.near < math.inf and 0 < self.view_height < math.inf):
+            raise ConfigError(
+                f"camera: expected near and view_height > 0 and finite, got {self.near:g}, {self.view_height:g}"
+            )
 
     @property
     def pixel_size(self) -> float:
@@ -129,6 +133,7 @@ def look_at(
     Raises:
         ConfigError: eye and at coincide, or up is parallel to the line of sight.
     """
+    check_finite("camera (eye, at, up)", torch.stack([eye, at, up]))
     back = normalize(eye - at)
     right = torch.linalg.cross(up, back)
     if back.norm() == 0 or right.norm() < 1e-6 * up.norm():

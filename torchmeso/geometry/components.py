@@ -68,6 +68,25 @@ def find(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Component
     return Components(of_face, ~unbalanced, _signed_volume(vertices, faces, of_face, count))
 
 
+def twins(found: Components, vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Bool[Tensor, "F"]:
+    """Return the second faces of components in which every face lies back to back on another: sheets with two sides.
+
+    Such a component bounds nothing, and which side of it is nearer would be left to rounding.
+    """
+    corner = weld(vertices)[faces]
+    smallest = corner.argmin(1, keepdim=True)
+    turned = corner.gather(1, (smallest + torch.arange(3)) % 3)  # the same face may begin at any of its corners
+    backwards = turned[:, 1] > turned[:, 2]
+    _, place = torch.unique(corner.sort(1).values, dim=0, return_inverse=True)
+    side = torch.where(backwards, -1, 1)
+    count = int(place.max()) + 1 if len(place) else 0
+    unpaired = torch.zeros(count, dtype=torch.long).index_add_(0, place, side) != 0
+    bounding = torch.zeros(len(found.closed), dtype=torch.bool)
+    bounding[found.of_face[unpaired[place]]] = True
+    first = torch.full((count,), len(faces)).scatter_reduce_(0, place, torch.arange(len(faces)), "amin")
+    return ~bounding[found.of_face] & (backwards != backwards[first[place]])
+
+
 def _signed_volume(vertices: Tensor, faces: Tensor, of_face: Tensor, count: int) -> Tensor:
     """Return the float64 volume of each component, summed about its own first vertex against cancellation."""
     p = vertices.double()[faces]

@@ -97,13 +97,13 @@ class _Reader:
             raise GeometryError(f"expected uv_set 0 to {max(most, 1) - 1}, got {self.uv_set}")
         first = np.cumsum([0, *(len(p.vertices) for p in pieces)])
 
-        def join(name: str) -> Tensor | None:
+        def join(name: str, dtype: type = np.float32) -> Tensor | None:
             arrays = [getattr(p, name) for p in pieces]
             if any(x is None for x in arrays):
                 return None
-            return torch.from_numpy(np.concatenate(arrays).astype(np.float32))
+            return torch.from_numpy(np.concatenate(arrays).astype(dtype))
 
-        vertices, tangents = join("vertices"), join("tangents")
+        vertices, tangents = join("vertices", np.float64), join("tangents")
         normals = join("normals") if tangents is not None else None
         assert vertices is not None
         return MeshFile(

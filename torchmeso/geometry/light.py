@@ -13,8 +13,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchmeso.errors import check_range, check_shape
+from torchmeso.errors import check_finite, check_range, check_shape
 from torchmeso.geometry.directions import dot, normalize
+
+MOST_POWER = 1e20
+"""Of a light: the radiance of the largest reflectance (`data.btf.LARGEST`) beside it is still a float32."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -30,9 +33,11 @@ class DirectionalLight:
     irradiance: Float[Tensor, "3"]
 
     def __post_init__(self) -> None:
-        """Raise ShapeError unless both are RGB or xyz triples."""
+        """Raise ShapeError unless both are RGB or xyz triples that mean a light."""
         check_shape("light.direction", self.direction, (3,))
         check_shape("light.irradiance", self.irradiance, (3,))
+        _check_unit("light.direction", self.direction)
+        check_finite("light.irradiance", self.irradiance, 0, MOST_POWER)
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -48,9 +53,11 @@ class PointLight:
     intensity: Float[Tensor, "3"]
 
     def __post_init__(self) -> None:
-        """Raise ShapeError unless both are triples."""
+        """Raise ShapeError unless both are triples that mean a light."""
         check_shape("light.position", self.position, (3,))
         check_shape("light.intensity", self.intensity, (3,))
+        check_finite("light.position", self.position)
+        check_finite("light.intensity", self.intensity, 0, MOST_POWER)
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -76,11 +83,20 @@ class SpotLight:
         check_shape("light.position", self.position, (3,))
         check_shape("light.axis", self.axis, (3,))
         check_shape("light.intensity", self.intensity, (3,))
+        check_finite("light.position", self.position)
+        _check_unit("light.axis", self.axis)
+        check_finite("light.intensity", self.intensity, 0, MOST_POWER)
         check_range("light.outer_deg", self.outer_deg, 0.1, 85)
         check_range("light.inner_deg", self.inner_deg, 0, self.outer_deg)
 
 
 Light = DirectionalLight | PointLight | SpotLight
+
+
+def _check_unit(name: str, w: Tensor) -> None:
+    """Raise ShapeError unless `w` is a direction."""
+    check_finite(name, w)
+    check_finite(f"{name} (its length)", w.norm()[None], 1 - 1e-3, 1 + 1e-3)
 
 
 def illuminate(

@@ -25,6 +25,12 @@ from torchmeso.geometry.mesh_file import MeshFile
 CREASE_DEG = 60.0
 """Faces that meet at a sharper angle (degrees between normals) do not share a vertex normal."""
 
+FAR = 64.0
+"""Meshes farther from the origin than this many times their size keep float64 positions."""
+
+FARTHEST, MOST_TILES = 1e15, 1e5
+"""Positions, and extents of texture coordinates, beyond which float32 arithmetic has no meaning."""
+
 ANISOTROPY_WARNING = 2.0
 """Mean ratio of the singular values of the texture map above which `load` and `dress` warn."""
 
@@ -34,7 +40,7 @@ class Mesh:
     """A mesh ready to be dressed; every per-vertex array has the same length V.
 
     Attributes:
-        vertices: (V, 3) world positions.
+        vertices: (V, 3) world positions; float64 where the mesh lies far from the origin (`FAR`).
         faces: (F, 3) vertex numbers, counter-clockwise seen from outside.
         uv: (V, 2) texture coordinates in tiles, unbounded, v up.
         normals: (V, 3) unit, outwards.
@@ -86,6 +92,13 @@ def dress_file(found: MeshFile, *, tiles: tuple[float, float] = (1.0, 1.0), name
     Raises:
         GeometryError: there are no texture coordinates, or none that cover anything.
     """
+    return dress_parts(found, tiles=tiles, name=name)[0]
+
+
+def dress_parts(
+    found: MeshFile, *, tiles: tuple[float, float] = (1.0, 1.0), name: str = "mesh"
+) -> tuple[Mesh, Int[Tensor, "F"]]:
+    """Return the same, and the part that each of its faces belongs to; arguments and errors as for `dress_file`."""
     if found.uv is None:
         raise GeometryError(
             f"{name}: expected texture coordinates, got none; "
@@ -94,7 +107,10 @@ def dress_file(found: MeshFile, *, tiles: tuple[float, float] = (1.0, 1.0), name
     given = None
     if found.normals is not None and found.tangents is not None:
         given = Frames(found.normals, found.tangents[:, :3], found.tangents[:, 3])
-    return dress(found.vertices, found.faces, found.uv * torch.tensor(tiles), given=given, name=name)
+    dressed, kept = _dress(
+        _sharp(found.vertices, torch.float32), found.faces, found.uv * torch.tensor(tiles), given, name
+    )
+    return dressed, found.part[kept]
 
 
 class Frames(NamedTuple):
@@ -125,11 +141,24 @@ def dress(
         name: what warnings and errors call the mesh.
 
     Raises:
-        GeometryError: no face has both world and texture area, or a value is not finite.
+        GeometryError: no face has both world and texture area, a value is not finite or too large, or a face names a
+            vertex that is not there.
     """
-    if not (torch.isfinite(vertices).all() and torch.isfinite(uv).all()):
-        raise GeometryError(f"{name}: expected finite positions and texture coordinates, got NaN or infinity")
+    return _dress(vertices, faces, uv, given, name)[0]
+
+
+def _dress(
+    vertices: Tensor, faces: Tensor, uv: Tensor, given: Frames | None, name: str
+) -> tuple[Mesh, Bool[Tensor, "F"]]:
+    """Return the mesh, and which faces were kept."""
+    _check_arrays(name, vertices, faces, uv)
+    uv = _near_zero(uv)
     found = components.find(vertices, faces)
+    twin = components.twins(found, vertices, faces)
+    if bool(twin.any()):
+        warnings.warn(f"{name}: {int(twin.sum())} faces lay back to back on others and were left out", stacklevel=2)
+        faces = faces[~twin]
+        found = components.find(vertices, faces)
     flip = components.inside_out(found, vertices, faces)[found.of_face]
     if bool(flip.any()):
         warnings.warn(f"{name}: {int(flip.sum())} faces of closed parts looked inwards and were turned", stacklevel=2)
@@ -144,18 +173,19 @@ def dress(
     if given is not None:
         given = _turned(given, faces[flip])
         scale = _texture_scale(jacobian, usable, faces, _groups(position, given.normals))
-        return Mesh(
+        kept_frames = Mesh(
             vertices=vertices,
             faces=faces,
             uv=uv,
             normals=given.normals,
             tangents=given.tangents,
             sign=given.sign,
-            scale=scale.to(vertices.dtype),
+            scale=scale.to(uv.dtype),
             component=found.of_face,
             closed=found.closed,
         )
-    corner_normal = _corner_normals(vertices, faces, position)
+        return kept_frames, ~twin
+    corner_normal = _corner_normals(vertices, faces, position).to(uv.dtype)
     handed = torch.where(jacobian.uv_area < 0, -1.0, 1.0)
     split = _split(faces, corner_normal, handed)
     source = split.source
@@ -164,17 +194,18 @@ def dress(
     scale = _texture_scale(jacobian, usable, split.faces, group)
     sign = handed[split.corner // 3]
     tangents = _tangents(jacobian, usable, split.faces, normals, 2 * group + (sign < 0))
-    return Mesh(
+    dressed = Mesh(
         vertices=vertices[source],
         faces=split.faces,
         uv=uv[source],
         normals=normals,
         tangents=tangents,
-        sign=sign.to(vertices.dtype),
-        scale=scale.to(vertices.dtype),
+        sign=sign.to(uv.dtype),
+        scale=scale.to(uv.dtype),
         component=found.of_face,
         closed=found.closed,
     )
+    return dressed, ~twin
 
 
 def transform(mesh: Mesh, matrix: Float[Tensor, "4 4"]) -> Mesh:
@@ -188,10 +219,10 @@ def transform(mesh: Mesh, matrix: Float[Tensor, "4 4"]) -> Mesh:
     rotation = linear / size
     if linear.det() <= 0 or not torch.allclose(rotation @ rotation.T, torch.eye(3, dtype=torch.float64), atol=1e-5):
         raise GeometryError("transform: expected rotation, positive uniform scale and translation only")
-    dtype = mesh.vertices.dtype
+    dtype = mesh.normals.dtype
     return replace(
         mesh,
-        vertices=(mesh.vertices.double() @ linear.T + matrix[:3, 3].double()).to(dtype),
+        vertices=_sharp(mesh.vertices.double() @ linear.T + matrix[:3, 3].double(), dtype),
         normals=(mesh.normals.double() @ rotation.T).to(dtype),
         tangents=(mesh.tangents.double() @ rotation.T).to(dtype),
         scale=mesh.scale * size.to(dtype),
@@ -209,6 +240,45 @@ def _groups(position: Int[Tensor, "V"], normals: Float[Tensor, "V 3"]) -> Int[Te
     """Return a number for each vertex; those at one position with one normal share it."""
     normal = components.weld(normals)
     return torch.unique(position * (normal.max() + 1) + normal, return_inverse=True)[1]
+
+
+def _check_arrays(name: str, vertices: Tensor, faces: Tensor, uv: Tensor) -> None:
+    check_shape(f"{name}: vertices", vertices, (-1, 3))
+    check_shape(f"{name}: faces", faces, (-1, 3))
+    check_shape(f"{name}: texture coordinates", uv, (len(vertices), 2))
+    if not (torch.isfinite(vertices).all() and torch.isfinite(uv).all()):
+        raise GeometryError(f"{name}: expected finite positions and texture coordinates, got NaN or infinity")
+    if len(faces) == 0:
+        raise GeometryError(f"{name}: expected triangles, got none")
+    if int(faces.min()) < 0 or int(faces.max()) >= len(vertices):
+        found = f"{int(faces.min())} to {int(faces.max())}"
+        raise GeometryError(f"{name}: expected vertex numbers from 0 to {len(vertices) - 1}, got {found}")
+    if float(vertices.abs().max()) > FARTHEST:
+        raise GeometryError(
+            f"{name}: expected positions within {FARTHEST:g} of the origin, got {float(vertices.abs().max()):g}"
+        )
+    extent = float((uv.amax(0) - uv.amin(0)).max())
+    if extent > MOST_TILES:
+        raise GeometryError(
+            f"{name}: expected texture coordinates over at most {MOST_TILES:g} tiles, got {extent:g}; "
+            "single precision could not tell their texels apart"
+        )
+
+
+def _near_zero(uv: Tensor) -> Tensor:
+    """Return texture coordinates moved by whole tiles where they lie far from 0, so that fractions stay sharp."""
+    low, high = uv.double().aminmax(dim=0)
+    middle = (low + high) / 2
+    far = middle.abs() > 16 + (high - low)
+    return (uv.double() - torch.where(far, middle.floor(), 0.0)).to(uv.dtype)
+
+
+def _sharp(vertices: Float[Tensor, "V 3"], dtype: torch.dtype) -> Float[Tensor, "V 3"]:
+    """Return float64 positions in `dtype`, or as they are where they lie so far out that it would blur them."""
+    if len(vertices) == 0:
+        return vertices.to(dtype)
+    size = float((vertices.amax(0) - vertices.amin(0)).max())
+    return vertices if float(vertices.abs().max()) > FAR * size else vertices.to(dtype)
 
 
 class _Jacobian(NamedTuple):
@@ -278,7 +348,7 @@ def _corner_normals(vertices: Tensor, faces: Tensor, position: Tensor) -> Tensor
     normal[bent] = _over_creases(facing[bent], angle[bent], around[bent])
     lost = normal.norm(dim=-1) < 1e-12  # around faces without area any unit vector will do
     normal[lost] = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-    return normalize(normal).to(vertices.dtype).reshape(-1, 3, 3)
+    return normalize(normal).reshape(-1, 3, 3)
 
 
 def _over_creases(facing: Tensor, angle: Tensor, around: Tensor) -> Tensor:

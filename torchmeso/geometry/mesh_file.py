@@ -50,7 +50,7 @@ class MeshFile:
     """A mesh as it was found.
 
     Attributes:
-        vertices: (V, 3) world.
+        vertices: (V, 3) world, float64 where the file says as much.
         faces: (F, 3).
         uv: (V, 2) v up; None where a face has none.
         normals: (V, 3) unit, as the file gives them together with tangents; None elsewhere.
@@ -130,7 +130,7 @@ def _read_trimesh(path: Path) -> MeshFile:
     found = [uv for uv in uvs if uv is not None and len(uv)]
     names = [path.stem] if len(parts) == 1 else [str(p.metadata.get("name", i)) for i, p in enumerate(parts)]
     return MeshFile(
-        vertices=torch.from_numpy(np.concatenate([part.vertices for part in parts]).astype(np.float32)),
+        vertices=torch.from_numpy(np.concatenate([part.vertices for part in parts]).astype(np.float64)),
         faces=torch.from_numpy(
             np.concatenate([part.faces + n for part, n in zip(parts, first[:-1], strict=True)]).astype(np.int64)
         ),

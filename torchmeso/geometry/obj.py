@@ -52,7 +52,7 @@ def read(path: Path) -> MeshFile:
         uv = _columns(textures, 2) if len(textures) and bool((corners[..., 1] >= 0).all()) else None
         source, faces = _join(corners, uv is not None)
         used_vertices = vertices[source[:, 0]]
-        used_uv = None if uv is None else torch.from_numpy(uv[source[:, 1]])
+        used_uv = None if uv is None else torch.from_numpy(uv[source[:, 1]]).float()
     except GeometryError:
         raise
     except (ValueError, IndexError) as error:
@@ -71,13 +71,13 @@ def read(path: Path) -> MeshFile:
 def _columns(lines: list[str], count: int) -> np.ndarray:
     """Return the first `count` numbers of every line; a missing second texture coordinate is 0."""
     if not lines:
-        return np.zeros((0, count), np.float32)
+        return np.zeros((0, count))
     flat = " ".join(lines)
     rows = [line.split() for line in lines] if "#" not in flat else [line.partition("#")[0].split() for line in lines]
     if {len(row) for row in rows} != {count}:
         flat = " ".join(" ".join((row + ["0"] * count)[:count]) for row in rows)
     # float() of Python reads text faster than numpy does.
-    return np.fromiter(map(float, flat.split()), np.float32, count * len(rows)).reshape(-1, count)
+    return np.fromiter(map(float, flat.split()), np.float64, count * len(rows)).reshape(-1, count)
 
 
 def _absolute(polygon: str, n_position: int, n_texture: int) -> str:

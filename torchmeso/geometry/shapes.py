@@ -22,6 +22,7 @@ Tiles = tuple[float, float]
 
 def plane(*, size: tuple[float, float] = (2.0, 2.0), tiles: Tiles = (4, 4), triangles: int = 2) -> Mesh:
     """Return a rectangle of `size` in the xz plane, normal +y, u along +x and v along -z."""
+    _check_sizes(width=size[0], depth=size[1])
     n_a, n_b = _segments(triangles, aspect=size[0] / size[1], least=(1, 1))
 
     def point(a: Tensor, b: Tensor) -> Tensor:
@@ -32,6 +33,7 @@ def plane(*, size: tuple[float, float] = (2.0, 2.0), tiles: Tiles = (4, 4), tria
 
 def cylinder(*, radius: float = 1.0, height: float = 2.0, tiles: Tiles = (8, 3), triangles: int = 2048) -> Mesh:
     """Return a closed cylinder around the y axis; its caps carry the texture at the scale of the side."""
+    _check_sizes(radius=radius, height=height)
     n_a, n_b = _segments(triangles, aspect=2 * math.pi * radius / height, least=(8, 1))
 
     def side(a: Tensor, b: Tensor) -> Tensor:
@@ -55,6 +57,7 @@ def cylinder(*, radius: float = 1.0, height: float = 2.0, tiles: Tiles = (8, 3),
 
 def sphere(*, radius: float = 1.0, tiles: Tiles = (12, 6), triangles: int = 5000) -> Mesh:
     """Return a closed sphere around the origin with its poles on the y axis."""
+    _check_sizes(radius=radius)
     n_a, n_b = _segments(triangles, aspect=2.0, least=(8, 4))
 
     def point(a: Tensor, b: Tensor) -> Tensor:
@@ -67,6 +70,7 @@ def sphere(*, radius: float = 1.0, tiles: Tiles = (12, 6), triangles: int = 5000
 
 def torus(*, radius: float = 1.0, tube: float = 0.4, tiles: Tiles = (8, 3), triangles: int = 3200) -> Mesh:
     """Return a closed torus around the y axis; u runs along the tube, v around it."""
+    _check_sizes(radius=radius, tube=tube)
     n_a, n_b = _segments(triangles, aspect=radius / tube, least=(8, 6))
 
     def point(a: Tensor, b: Tensor) -> Tensor:
@@ -88,6 +92,10 @@ def torus_knot(
     triangles: int = 11952,
 ) -> Mesh:
     """Return a closed (p, q) torus knot; 11,952 triangles are 332 x 18 quads, as in wang2005mdf, Table 2."""
+    _check_sizes(radius=radius, tube=tube)
+    check_range("shape.p", p, 1, 100)
+    check_range("shape.q", q, 0, 100)
+    check_range("shape.swing", swing, 0, 1e9)
     curve = _knot(p, q, radius, swing)
     length = float((curve(torch.linspace(0, 1, 2001, dtype=torch.float64)).diff(dim=0)).norm(dim=-1).sum())
     n_a, n_b = _segments(triangles, aspect=length / (2 * math.pi * tube), least=(16, 6))
@@ -102,6 +110,11 @@ def torus_knot(
         return centre + tube * (side * around.cos() + up * around.sin())
 
     return _from_grid("torus_knot", point, n_a, n_b, tiles, wrap=(True, True))
+
+
+def _check_sizes(**sizes: float) -> None:
+    for name, size in sizes.items():
+        check_range(f"shape.{name}", size, 1e-9, 1e9)
 
 
 SHAPES: dict[str, Callable[..., Mesh]] = {

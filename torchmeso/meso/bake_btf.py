@@ -19,7 +19,7 @@ from torch import Tensor
 from torchmeso.data import btf as btf_data
 from torchmeso.data.address import texel_centres
 from torchmeso.data.btf import Btf
-from torchmeso.data.store import open_blocks
+from torchmeso.data.store import open_blocks, writing
 from torchmeso.errors import check_memory, check_range
 from torchmeso.geometry import hemisphere
 from torchmeso.geometry.light import DirectionalLight
@@ -87,12 +87,13 @@ def bake(
     attributes = {**btf_data.table_attributes(lights, views, meso.h), **about}
     writer = open_blocks(path, btf_data.specs(shape), attributes)
     tracer = TileTracer(meso.geometry, meso.h)
-    for view in range(len(views)):
-        if not writer.is_done(view):
-            writer["images"][:, view] = view_column(tracer, view, options).to(torch.float16).numpy()
-            writer.mark_done(view)
-        progress((view + 1) / len(views))
-    writer.finish()
+    with writing(path):
+        for view in range(len(views)):
+            if not writer.is_done(view):
+                writer["images"][:, view] = view_column(tracer, view, options).to(torch.float16).numpy()
+                writer.mark_done(view)
+            progress((view + 1) / len(views))
+        writer.finish()
 
 
 def in_memory(meso: Mesostructure, options: BtfOptions) -> Btf:

@@ -18,7 +18,7 @@ from torch import Tensor
 from torchmeso.data import mdf as mdf_data
 from torchmeso.data.address import texel_centres
 from torchmeso.data.mdf import MIN_COS, Mdf
-from torchmeso.data.store import open_blocks
+from torchmeso.data.store import open_blocks, writing
 from torchmeso.errors import check_memory, check_range
 from torchmeso.geometry import hemisphere
 from torchmeso.meso.mesostructure import Mesostructure
@@ -108,15 +108,16 @@ def bake(
     attributes = {**mdf_data.table_attributes(directions, meso.h), **about}
     writer = open_blocks(path, mdf_data.specs(shape, options.storage), attributes)
     caster = RayCastMdf(meso)
-    for view, wo in enumerate(directions.directions()):
-        if not writer.is_done(view):
-            delta, no_hit = drop_image(caster, wo, options.texels)
-            codes = (delta * 255).round().to(torch.uint8) if options.storage == "uint8" else delta
-            writer["delta"][view] = codes.numpy()
-            writer["no_hit"][view] = no_hit.numpy()
-            writer.mark_done(view)
-        progress((view + 1) / len(directions))
-    writer.finish()
+    with writing(path):
+        for view, wo in enumerate(directions.directions()):
+            if not writer.is_done(view):
+                delta, no_hit = drop_image(caster, wo, options.texels)
+                codes = (delta * 255).round().to(torch.uint8) if options.storage == "uint8" else delta
+                writer["delta"][view] = codes.numpy()
+                writer["no_hit"][view] = no_hit.numpy()
+                writer.mark_done(view)
+            progress((view + 1) / len(directions))
+        writer.finish()
 
 
 def drop_image(

@@ -100,7 +100,7 @@ def from_file(
     """
     found = mesh_file.read(path)
     vertices, faces = found.vertices, found.faces
-    vertices = vertices - torch.tensor([0.0, 0.0, float(vertices[:, 2].max())])
+    vertices = (vertices - torch.tensor([0.0, 0.0, float(vertices[:, 2].max())])).float()
     depth = max(float(-vertices[:, 2].min()), 1e-6) if h is None else h
     part = torch.zeros(len(faces), dtype=torch.long)
     geometry = Geometry(vertices=vertices, faces=faces, part=part, palette=palette((albedo, roughness, f0)))

@@ -10,12 +10,12 @@ from typing import Literal
 import torch
 
 from torchmeso.config import Config, Vector
-from torchmeso.data import video
+from torchmeso.data import store, video
 from torchmeso.errors import check_range
 from torchmeso.geometry.camera import Camera
 from torchmeso.geometry.light import Light
 from torchmeso.pipeline import scene as scenes
-from torchmeso.pipeline.bake import Report, prepare, silent
+from torchmeso.pipeline.bake import CODE, Report, code_hash, file_hash, prepare, silent
 from torchmeso.pipeline.render import Painter
 
 Way = Literal["turntable", "light"]
@@ -38,10 +38,11 @@ def render(
     check_range("frames", frames, 1, 100_000)
     check_range("fps", fps, 1, 1000)
     painter = Painter(scenes.build(config, prepare(config, report)), config.render, config.backend)
-    with video.record(out, fps=fps, count=frames) as reel:
+    with video.record(out, fps=fps, count=frames, job=_job(config, way)) as reel:
         for i, (camera, lights) in enumerate(turn(config, frames, way)):
             report("frames", i / frames)
-            reel.add(painter.show(camera, lights))
+            if not reel.skip():
+                reel.add(painter.show(camera, lights))
     report("frames", 1)
     return video.paths(out, frames)
 
@@ -68,6 +69,14 @@ def turn(config: Config, frames: int, way: Way) -> Iterator[tuple[Camera, tuple[
                 for light in lights
             ]
         yield view.build(), tuple(light.build() for light in lights)
+
+
+def _job(config: Config, way: Way) -> str:
+    """Return a hash of all that decides what the frames show."""
+    files = [o.mesh for o in config.objects] + [m.model for m in config.materials.values()]
+    for material in config.materials.values():
+        files += material.meso.files if material.meso else []
+    return store.content_hash(repr(config), way, [file_hash(f) for f in files if f], code_hash((*CODE, "render")))
 
 
 def _around(point: Vector, centre: Vector, axis: Vector, angle_deg: float) -> Vector:

@@ -119,7 +119,8 @@ def bake_tables(
     for path, key in zip(paths, keys, strict=True):
         if out is not None and path.exists() and not force and not _is_finished(path, key):
             raise ConfigError(f"{path}: holds another table; give --force to replace it, or another folder")
-        path.parent.mkdir(parents=True, exist_ok=True)
+        with store.writing(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
     meso = material.meso.build()
     about: dict[str, object] = {"source": {"type": material.meso.type, **material.meso.arguments}}
     start = time.perf_counter()

@@ -26,7 +26,8 @@ def to_glb(path: str | Path, out: str | Path) -> None:
         bodies = _of_configuration(config.load(path))
     else:
         found = mesh_file.read(path)
-        bodies = [Body(path.stem, mesh.dress_file(found, name=path.name), found.part, found.groups)]
+        dressed, part = mesh.dress_parts(found, name=path.name)
+        bodies = [Body(path.stem, dressed, part, found.groups)]
     with replacing(out) as beside:
         beside.write_bytes(glb.encode(bodies))
 

@@ -106,9 +106,9 @@ def read_body(item: ObjectConfig) -> Body:
     looks = _looks(item, found.groups)
     if item.unwrap:
         found = _unwrapped(item, found)
-    dressed = mesh.dress_file(found, tiles=item.tiles_pair, name=item.mesh)
+    dressed, part = mesh.dress_parts(found, tiles=item.tiles_pair, name=item.mesh)
     kinds = list(dict.fromkeys(looks))
-    part = torch.tensor([kinds.index(look) for look in looks])[found.part]
+    part = torch.tensor([kinds.index(look) for look in looks])[part]
     return Body(dressed, part if len(kinds) > 1 else None, tuple(kinds))
 
 

@@ -70,7 +70,6 @@ def render(config: Config, report: Report = silent) -> Truth:
     camera, lights = config.camera.build(), [light.build() for light in config.lights]
     found = _trace(config, tracer, camera, lights, report)
     found = replace(found, owner=torch.tensor([*objects, -1])[found.owner])
-    path.parent.mkdir(parents=True, exist_ok=True)
     store.write_model(path, {"rgb": found.rgb, "depth": found.depth, "owner": found.owner}, {"kind": "truth"})
     return found
 
@@ -117,7 +116,7 @@ def _geometry(config: Config, mesos: dict[str, Mesostructure], body: Mesh, look:
         warnings.warn("truth: a normal map has no geometry; it is left out", stacklevel=2)
     colours = textured.from_finish(replace(finish, normal_map=None))
     return Geometry(
-        vertices=body.vertices,
+        vertices=body.vertices.float(),
         faces=body.faces,
         part=torch.zeros(len(body.faces), dtype=torch.long),
         palette=palette(((1.0, 1.0, 1.0), 1.0, 0.0)),

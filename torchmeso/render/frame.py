@@ -8,7 +8,7 @@ Test: tests/render/test_frame.py
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -105,6 +105,7 @@ def _render(scene: Scene, camera: Camera, options: FrameOptions) -> Picture:
     seconds: dict[str, float] = {}
     with _timed(seconds, "assemble"):
         world = assemble(scene)
+        camera, scene = world.seen_by(camera), replace(scene, lights=world.lit_by(scene.lights))
     with _timed(seconds, "shadow maps"):
         maps = _shadow_maps(scene, world, options)
     with _timed(seconds, "layers"):

@@ -28,7 +28,7 @@ from torchmeso.render import device, film, shadow_map
 from torchmeso.render.device_raster import ROOM, STAMPS, DeviceViews
 from torchmeso.render.film import Picture
 from torchmeso.render.frame import MEMORY_LIMIT, FrameOptions
-from torchmeso.render.scene import Scene, assemble
+from torchmeso.render.scene import Scene, World, assemble
 
 MAX_LIGHTS = 64
 """Of a frame, as in kernels_cl/render/shadow_map.clh."""
@@ -139,7 +139,9 @@ class Renderer:
         return picture.shown[: camera.height, : camera.width]
 
     def _frame(self, camera: Camera, lights: tuple[Light, ...] | None, outputs: int) -> "_Picture":
-        given = lights = self._on_device.scene.lights if lights is None else lights
+        world = self._on_device.world
+        given = lights = world.lit_by(self._on_device.scene.lights if lights is None else lights)
+        camera = world.seen_by(camera)
         reaching = [i for i, light in enumerate(lights) if not self._skips.unlit or self._reaches(light)]
         lights = tuple(lights[i] for i in reaching) if len(reaching) < len(lights) else lights
         if len(lights) > MAX_LIGHTS:
@@ -352,6 +354,7 @@ class _OnDevice(NamedTuple):
     """A scene and its side on the device."""
 
     scene: Scene
+    world: World
     geometry: device.DeviceGeometry
     materials: device.DeviceMaterials
     corners: Float[np.ndarray, "3 V"]  # see `shadow_map.cameras`
@@ -381,7 +384,8 @@ def _upload(scene: Scene, options: FrameOptions, before: _OnDevice | None = None
     if before is not None and same:
         return before._replace(scene=scene, materials=materials)
     world = assemble(scene)
-    return _OnDevice(scene, device.upload_geometry(world), materials, shadow_map.corners_of(world), object_of)
+    corners = shadow_map.corners_of(world)
+    return _OnDevice(scene, world, device.upload_geometry(world), materials, corners, object_of)
 
 
 @dataclass(eq=False, kw_only=True)

@@ -15,8 +15,8 @@ from torchmeso.errors import ConfigError, check_range, check_shape
 from torchmeso.geometry import frames
 from torchmeso.geometry.camera import Camera
 from torchmeso.geometry.frames import Frame
-from torchmeso.geometry.light import Light
-from torchmeso.geometry.mesh import Mesh
+from torchmeso.geometry.light import DirectionalLight, Light
+from torchmeso.geometry.mesh import FAR, Mesh
 from torchmeso.render.rasterize import Layers, barycentric
 
 
@@ -122,6 +122,9 @@ class Scene:
             raise ConfigError("scene: expected at least one object, got none")
         if self.ambient_rule not in ("add", "paper"):
             raise ConfigError(f"scene.ambient_rule: expected 'add' or 'paper', got '{self.ambient_rule}'")
+        check_range("scene.ambient", self.ambient, 0, 1e20)
+        for value in self.background:
+            check_range("scene.background", value, -1e20, 1e20)
 
     @property
     def surfaces(self) -> tuple[Material, ...]:
@@ -162,6 +165,7 @@ class World(NamedTuple):
         closed: (C,) whether a component is closed.
         owner: (F,) surface each face belongs to: its object's material, see `Scene.surfaces`.
         object: (surface,) object each surface belongs to.
+        origin: (3,) float64 where the vertices' origin lies in the world.
     """
 
     vertices: Float[Tensor, "V 3"]
@@ -175,6 +179,21 @@ class World(NamedTuple):
     closed: Bool[Tensor, "C"]
     owner: Int[Tensor, "F"]
     object: Int[Tensor, "surface"]
+    origin: Float[Tensor, "3"]
+
+    def seen_by(self, camera: Camera) -> Camera:
+        """Return `camera` as it stands to the vertices."""
+        return replace(camera, eye=camera.eye.double() - self.origin) if bool(self.origin.any()) else camera
+
+    def lit_by(self, lights: tuple[Light, ...]) -> tuple[Light, ...]:
+        """Return `lights` as they stand to the vertices."""
+        if not bool(self.origin.any()):
+            return lights
+        return tuple(
+            light if isinstance(light, DirectionalLight)
+            else replace(light, position=light.position.double() - self.origin)
+            for light in lights
+        )  # fmt: skip
 
 
 class Points(NamedTuple):
@@ -204,7 +223,11 @@ class Points(NamedTuple):
 
 
 def assemble(scene: Scene) -> World:
-    """Return the meshes of `scene` as one set of arrays."""
+    """Return the meshes of `scene` as one set of arrays.
+
+    A scene far from the world's origin gets an origin of its own, a whole number of units away: positions along rays
+    are as sharp there as at home.
+    """
     meshes = [o.mesh for o in scene.objects]
     first_vertex, first_component, faces, component = 0, 0, [], []
     for m in meshes:
@@ -221,10 +244,20 @@ def assemble(scene: Scene) -> World:
     def join(name: str) -> Tensor:
         return torch.cat([getattr(m, name) for m in meshes])
 
+    vertices, origin = _at_home(join("vertices"), meshes[0].normals.dtype)
     return World(
-        join("vertices"), torch.cat(faces), join("uv"), join("normals"), join("tangents"), join("sign"), join("scale"),
-        torch.cat(component), join("closed"), torch.cat(owner), torch.tensor(objects),
+        vertices, torch.cat(faces), join("uv"), join("normals"), join("tangents"), join("sign"), join("scale"),
+        torch.cat(component), join("closed"), torch.cat(owner), torch.tensor(objects), origin,
     )  # fmt: skip
+
+
+def _at_home(vertices: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    """Return vertices and their origin: moved there, in `dtype`, where the world's is far."""
+    low, high = vertices.double().aminmax(dim=0)
+    middle = (low + high) / 2
+    if float(middle.abs().max()) <= FAR * float((high - low).max()):
+        return vertices, torch.zeros(3, dtype=torch.float64)
+    return (vertices.double() - middle.round()).to(dtype), middle.round()
 
 
 def interpolate(world: World, layers: Layers, camera: Camera, which: Int[Tensor, "n"]) -> Points:
