@@ -104,7 +104,7 @@ static void shade_object(const Place *place, __global const Reflectance *reflect
     } else {
         view = footprint(TABLE(Ring, tables, reflectance->view_rings), reflectance->view_count, wo);
         look_around(TABLE(Level, tables, reflectance->levels), reflectance->level_count, seen->at.u, seen->at.v, wo,
-                    filtered, pixel, bits, &area);
+                    filtered, pixel, MOST_PROBES, bits, &area);
         first = view_weights(tables, reflectance, 0, &view, bits);
     }
     int lit = 0;
@@ -149,6 +149,10 @@ static void shade_object(const Place *place, __global const Reflectance *reflect
         }
         return;
     }
+    // Light from everywhere shows little of what is small: one place is enough.
+    if (area.count > 1)
+        look_around(TABLE(Level, tables, reflectance->levels), reflectance->level_count, seen->at.u, seen->at.v, wo,
+                    filtered, pixel, 1, bits, &area);
     reflect_ambient(tables, reflectance, &view, &first, &area, dark, T);
     for (int b = dark; b; b &= b - 1) rgb[__builtin_ctz(b)] += frame->ambient * not_negative(T[__builtin_ctz(b)]);
 }

@@ -70,15 +70,15 @@ def test_the_level_grows_smoothly_with_the_distance():
     width = torch.logspace(-1, 2, 4000, base=2 * math.pi, dtype=torch.float64)
     level = sum(p.level * p.weight for p in looks(width))
     assert (level.diff() >= -1e-9).all()
-    assert level.diff().max() < 0.03
+    assert level.diff().max() < 0.1  # a step of 1 / 4000 of the range; a jump would be 1
     assert level[-1] > 3
 
 
 def test_a_grazing_view_reads_along_the_texture():
-    """At 80.4 degrees a pixel is six times as long as wide: three places, all within it, around its centre."""
+    """At 80.4 degrees a pixel is six times as long as wide: two places, all within it, around its centre."""
     found = [p for p in looks(torch.full((1,), 4.0, dtype=torch.float64), 80.406) if p.weight[0] > 0]
     places = sorted({round(float(p.uv[0, 0]) * 64, 3) for p in found})
-    assert places == pytest.approx([-8, 0, 8], abs=0.05)
+    assert places == pytest.approx([-6, 6], abs=0.05)
     assert all(p.uv[0, 1] == 0 for p in found)
 
 

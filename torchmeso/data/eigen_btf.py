@@ -118,14 +118,17 @@ class EigenBtf:
     def ambient(
         self, uv: Float[Tensor, "*batch 2"], wo: Float[Tensor, "*batch 3"], seen: Footprint | None = None
     ) -> Float[Tensor, "*batch 3"]:
-        """Return L_a(uv, wo) = (1/pi) times the integral of T over the light hemisphere (white: 1)."""
+        """Return L_a(uv, wo) = (1/pi) times the integral of T over the light hemisphere (white: 1).
+
+        What is `seen` is read at one place: light from everywhere shows little of what is small.
+        """
 
         def look_up(which: Tensor, uv: Tensor, level: int) -> Tensor:
             E = self.ambient_maps[level]
             taps = address.bilinear(uv, *E.shape[:2])
             return (E.flatten(0, 1)[taps.texel].to(uv.dtype) * taps.weight[..., None, None]).sum(-3)
 
-        return self._weighted(pyramid.average(look_up, uv, seen, *self._size), wo)
+        return self._weighted(pyramid.average(look_up, uv, seen, *self._size, most=1), wo)
 
     def view_weights(self, wo: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch rank"]:
         """Return W(wo), interpolated."""

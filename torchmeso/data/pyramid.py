@@ -21,10 +21,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 MOST_PROBES = 4
-SLANT = 2.0
+SLANT = 3.0
 """Lengths over widths that one place stands for."""
 
-BLEND = 0.15
+BLEND = 0.05
 """Levels blend within this distance of the middle between two."""
 
 LEAST_COSINE = math.cos(math.radians(89.5))
@@ -67,7 +67,7 @@ def footprint(wo: Float[Tensor, "*batch 3"], pixel: Float[Tensor, "*batch"]) -> 
     return Footprint(pixel, way * (pixel / wo[..., 2].clamp(min=LEAST_COSINE)).unsqueeze(-1))
 
 
-def probes(uv: Float[Tensor, "n 2"], seen: Footprint, texels: int, levels: int) -> list[Probe]:
+def probes(uv: Float[Tensor, "n 2"], seen: Footprint, texels: int, levels: int, most: int = MOST_PROBES) -> list[Probe]:
     """Return the look-ups of pixels that cover `seen` around `uv`; their weights sum to 1.
 
     Args:
@@ -75,10 +75,11 @@ def probes(uv: Float[Tensor, "n 2"], seen: Footprint, texels: int, levels: int) 
         seen: what is covered.
         texels: along the longer side of the texture.
         levels: of its pyramid.
+        most: places along a pixel.
     """
     length = seen.along.norm(dim=-1)
     count = torch.minimum(length / seen.across.clamp(min=1e-30), length * texels)
-    count = (count / SLANT + 0.5).floor().clamp(1, MOST_PROBES)
+    count = (count / SLANT + 0.5).floor().clamp(1, most)
     share = seen.across * length / count * texels**2
     level = (0.5 * torch.log2(share.clamp(min=1e-30))).clamp(0, levels - 1)
     lower = level.floor()
@@ -100,6 +101,7 @@ def average(
     seen: Footprint | None,
     texels: int,
     levels: int,
+    most: int = MOST_PROBES,
 ) -> Tensor:
     """Return the mean of a texture over what is `seen`, or its value at the point where that is None.
 
@@ -109,6 +111,7 @@ def average(
         seen: what is covered.
         texels: along the longer side of the texture.
         levels: of its pyramid.
+        most: places along a pixel.
 
     Returns:
         (..., ...) the shape of uv's points, then that of a value.
@@ -117,7 +120,7 @@ def average(
         value = look_up(torch.ones(uv.shape[:-1].numel(), dtype=torch.bool), uv.reshape(-1, 2), 0)
         return value.reshape(*uv.shape[:-1], *value.shape[1:])
     total: Tensor | None = None
-    for probe in probes(uv, seen, texels, levels):
+    for probe in probes(uv, seen, texels, levels, most):
         for level in probe.level.unique().tolist():
             which = (probe.level == level) & (probe.weight > 0)
             value = look_up(which, probe.uv[which], level)
