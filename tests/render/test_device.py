@@ -12,7 +12,7 @@ def world(mesh):
 
 
 def test_structures_have_the_kernels_sizes():
-    assert [x.itemsize for x in (device.FACET, device.REFLECTANCE, device.MDF, device.LIGHT)] == [64, 128, 64, 64]
+    assert [x.itemsize for x in (device.FACET, device.LIGHT)] == [64, 64]
 
 
 def test_gradients_carry_barycentric_coordinates_along_a_face():
@@ -35,21 +35,3 @@ def test_interpolated_normals_turn_no_further_than_said():
     off = (n - torch.from_numpy(facets["normal"])).norm(dim=-1).amax(0).numpy()
     assert (off <= facets["turn"]).all()
     assert (facets["turn"] < 0.5).all()
-
-
-def test_tables_stand_on_blocks_of_64_bytes():
-    pool = device._Pool()
-    arrays = [np.arange(n, dtype=np.float32) for n in (3, 16, 17, 1)]
-    blocks = [pool.add(x) for x in arrays]
-    whole = pool.joined()
-    assert blocks == [0, 1, 2, 4]
-    for block, x in zip(blocks, arrays, strict=True):
-        np.testing.assert_array_equal(whole[64 * block : 64 * block + x.nbytes].view(np.float32), x)
-
-
-def test_components_stand_in_vectors_of_four():
-    x = torch.arange(6 * 3, dtype=torch.float32).reshape(1, 6, 3)
-    grouped = device._grouped(x)
-    assert grouped.shape == (1, 2, 16)
-    torch.testing.assert_close(grouped.reshape(1, 8, 4)[:, :6, :3], x)
-    assert grouped.reshape(1, 8, 4)[:, 6:].abs().sum() == 0

@@ -24,7 +24,7 @@ from torchmeso.data import image
 from torchmeso.errors import BackendError, check_memory
 from torchmeso.geometry.camera import Camera
 from torchmeso.geometry.light import DirectionalLight, Light, SpotLight
-from torchmeso.render import device, film, shadow_map
+from torchmeso.render import device, device_tables, film, shadow_map
 from torchmeso.render.device_raster import ROOM, STAMPS, DeviceViews
 from torchmeso.render.film import Picture
 from torchmeso.render.frame import MEMORY_LIMIT, FrameOptions
@@ -356,7 +356,7 @@ class _OnDevice(NamedTuple):
     scene: Scene
     world: World
     geometry: device.DeviceGeometry
-    materials: device.DeviceMaterials
+    materials: device_tables.DeviceMaterials
     corners: Float[np.ndarray, "3 V"]  # see `shadow_map.cameras`
     object_of: list[int]  # of each surface
 
@@ -373,7 +373,7 @@ class _OnDevice(NamedTuple):
 
 def _upload(scene: Scene, options: FrameOptions, before: _OnDevice | None = None) -> _OnDevice:
     """Return `scene` on the device, with what it shares with the one before."""
-    materials = device.upload_materials(
+    materials = device_tables.upload_materials(
         scene.surfaces,
         silhouettes=options.silhouette != "none",
         ambient=scene.ambient > 0,

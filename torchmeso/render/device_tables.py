@@ -1,0 +1,345 @@
+"""Materials as the kernels read them: BTFs, MDFs and pictures packed into one buffer of tables.
+
+A table is uploaded once, however many materials share it and however often the scene changes around it. All stand in
+one buffer, each on a block of 64 bytes, because a kernel's arguments cannot be a list.
+
+Kernels: kernels_cl/data/*.clh          Test: tests/render/test_device_tables.py
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int, Int32, UInt8, UInt16
+from torch import Tensor
+
+from torchmeso.backends import opencl
+from torchmeso.data.eigen_btf import EigenBtf
+from torchmeso.data.mdf import Mdf
+from torchmeso.data.relief import CODES as RELIEF_CODES
+from torchmeso.data.textured import Textured
+from torchmeso.errors import BackendError
+from torchmeso.geometry import hemisphere
+from torchmeso.geometry.hemisphere import DirectionSet
+from torchmeso.render.scene import Material
+
+BLOCK, GROUP = 64, 4
+"""Bytes that tables are aligned to, and components that stand in one vector."""
+
+REFLECTANCE = np.dtype(
+    [(name, "i4") for name in ("there", "height", "width", "groups", "codes", "light_rings", "light_count")]
+    + [(name, "i4") for name in ("view_rings", "view_count", "maps", "weights", "scale", "offset", "ambient")]
+    + [(name, "i4") for name in ("ambient_scale", "ambient_offset", "levels", "level_count")]
+    + [("last_cosine", "f4"), ("albedo", "f4", 3)]
+    + [(name, "i4") for name in ("normals", "normal_levels", "normal_level_count")]
+    + [("pad", "i4", 7)]
+)
+EIGEN, TEXTURED = 1, 2
+"""What stands in a reflectance's `there`; 0 = a plain colour."""
+
+MDF = np.dtype(
+    [(name, "i4") for name in ("there", "height", "width", "rings", "ring_count", "delta", "missing")]
+    + [(name, "i4") for name in ("relief_height", "relief_width", "relief", "hole")]
+    + [("h", "f4"), ("delta_max", "f4"), ("plateau", "i4"), ("pad", "i4", 2)]
+)
+
+ADDRESSES = {
+    REFLECTANCE: (
+        "light_rings",
+        "view_rings",
+        "maps",
+        "weights",
+        "scale",
+        "offset",
+        "ambient",
+        "ambient_scale",
+        "ambient_offset",
+        "levels",
+        "normals",
+        "normal_levels",
+    ),
+    MDF: ("rings", "delta", "missing", "relief", "plateau", "hole"),
+}
+"""Fields that say on which block a table begins; -1 = there is none."""
+
+
+class DeviceMaterials(NamedTuple):
+    """The materials of a scene on the device.
+
+    Attributes:
+        tables: everything that is looked up.
+        mdfs: (surface,) see `MDF`.
+        reflectances: (surface,) see `REFLECTANCE`.
+        textured: whether any surface has a mesostructure.
+        parts: the BTFs and MDFs in `tables`, by identity.
+        packed: how many of them were uploaded, not taken over.
+    """
+
+    tables: "opencl.Buffer"
+    mdfs: "opencl.Buffer"
+    reflectances: "opencl.Buffer"
+    textured: bool
+    parts: "dict[tuple[int, bool], _Part]"
+    packed: int
+
+
+class _Part(NamedTuple):
+    """A BTF or an MDF in the tables."""
+
+    source: object  # kept, so that nothing else can take its identity
+    first: int  # block
+    blocks: int
+    record: np.ndarray  # (1,), addresses counted from `first`
+
+
+def upload_materials(
+    materials: Sequence[Material], *, silhouettes: bool, ambient: bool, before: DeviceMaterials | None = None
+) -> DeviceMaterials:
+    """Return the materials of a scene's surfaces on the device.
+
+    Args:
+        materials: of each surface.
+        silhouettes: whether the mesostructure has depth; without, MDFs are not read.
+        ambient: whether the ambient term is needed.
+        before: what stands on the device already; BTFs and MDFs that are the same objects are taken over from there.
+
+    Raises:
+        BackendError: there is no device, or a material is of a kind that kernels do not read.
+    """
+    wanted: dict[tuple[int, bool], EigenBtf | Textured | Mdf] = {}
+    for m in materials:
+        if m.btf is not None:
+            wanted[id(m.btf), ambient] = _readable(m.btf)
+        if m.mdf is not None and silhouettes:
+            wanted[id(m.mdf), False] = _readable_mdf(m.mdf)
+    there = before.parts if before is not None else {}
+    new = {key: source for key, source in wanted.items() if key not in there}
+    if before is not None and not new:
+        tables, parts = before.tables, there
+    else:
+        tables, parts = _join({key: there[key] for key in wanted if key in there}, new, before)
+
+    reflectances, mdfs = np.zeros(len(materials), REFLECTANCE), np.zeros(len(materials), MDF)
+    for i, m in enumerate(materials):
+        if m.btf is not None:
+            reflectances[i] = _placed(parts[id(m.btf), ambient])
+        reflectances[i]["albedo"] = m.albedo
+        if m.mdf is not None and silhouettes:
+            mdfs[i] = _placed(parts[id(m.mdf), False])
+    textured = bool(mdfs["there"].any())
+    return DeviceMaterials(tables, opencl.upload(mdfs), opencl.upload(reflectances), textured, parts, len(new))
+
+
+def _join(
+    kept: "dict[tuple[int, bool], _Part]",
+    new: "dict[tuple[int, bool], EigenBtf | Textured | Mdf]",
+    before: DeviceMaterials | None,
+) -> "tuple[opencl.Buffer, dict[tuple[int, bool], _Part]]":
+    """Return a buffer with the parts that are `kept`, copied on the device, and behind them the `new` ones."""
+    parts, copies, blocks = {}, [], 0
+    for key, part in kept.items():
+        copies.append((part.first * BLOCK, blocks * BLOCK, part.blocks * BLOCK))
+        parts[key] = part._replace(first=blocks)
+        blocks += part.blocks
+    arrays = []
+    for key, source in new.items():
+        pool = _Pool()
+        if isinstance(source, EigenBtf):
+            record = _reflectance(pool, source, ambient=key[1])
+        else:
+            record = _pictures(pool, source) if isinstance(source, Textured) else _mdf(pool, source)
+        arrays.append(pool.joined())
+        parts[key] = _Part(source, blocks, len(arrays[-1]) // BLOCK, record)
+        blocks += parts[key].blocks
+    fresh = np.concatenate(arrays) if arrays else np.zeros(BLOCK, np.uint8)
+    if not copies or before is None:
+        return opencl.upload(fresh), parts
+    tables = opencl.allocate(blocks * BLOCK)
+    for source, target, size in copies:
+        opencl.copy(before.tables, tables, source, target, size)
+    opencl.store(fresh, tables, blocks * BLOCK - len(fresh))
+    return tables, parts
+
+
+def _placed(part: _Part) -> np.ndarray:
+    """Return a part's record with addresses counted from the beginning of all tables."""
+    record = part.record.copy()
+    for name in ADDRESSES[record.dtype]:
+        record[name] += np.where(record[name] >= 0, part.first, 0)
+    return record[0]
+
+
+def _readable(btf: object) -> EigenBtf | Textured:
+    if not isinstance(btf, EigenBtf | Textured):
+        raise BackendError(f"opencl: expected an eigen BTF, got {type(btf).__name__}; use the torch backend")
+    return btf
+
+
+def _readable_mdf(mdf: object) -> Mdf:
+    if not isinstance(mdf, Mdf) or mdf.delta.dtype != torch.uint8:
+        kind = f"{mdf.delta.dtype}" if isinstance(mdf, Mdf) else type(mdf).__name__
+        raise BackendError(f"opencl: expected an MDF of 8 bits, got {kind}; use the torch backend")
+    return mdf
+
+
+def _reflectance(pool: "_Pool", btf: EigenBtf, *, ambient: bool) -> np.ndarray:
+    record = np.zeros(1, REFLECTANCE)
+    groups = -(-btf.rank // GROUP)
+    codes = btf.maps.dtype == torch.uint8
+    height, width = btf.texels
+    maps = [hemisphere.with_pole(x if codes else x.float(), btf.lights).flatten(0, 2) for x in btf.levels]
+    weights = hemisphere.with_pole(btf.weights.float(), btf.views)
+    scale, offset = _grouped(btf.scale.float()[None])[0], _grouped(btf.offset.float()[None])[0]
+    by_channel = _grouped(weights[:, :, None].expand(-1, -1, 3))
+    by_channel[:, :, 3] = _bounds(btf, weights)
+    record["there"], record["height"], record["width"], record["groups"] = EIGEN, height, width, groups
+    record["codes"] = codes
+    record["light_rings"], record["light_count"] = pool.add(_rings(btf.lights)), _ring_count(btf.lights)
+    record["view_rings"], record["view_count"] = pool.add(_rings(btf.views)), _ring_count(btf.views)
+    record["maps"] = pool.add(_grouped(torch.cat(maps)).numpy())
+    record["levels"], record["level_count"] = pool.add(_level_records(btf, [len(x) for x in maps])), len(maps)
+    record["weights"], record["scale"], record["offset"] = (pool.add(x.numpy()) for x in (by_channel, scale, offset))
+    if ambient:
+        values, unit, zero = _as_codes(torch.cat([x.flatten(0, 1) for x in btf.ambient_maps]).float(), codes=codes)
+        record["ambient"] = pool.add(_grouped(values).numpy())
+        record["ambient_scale"], record["ambient_offset"] = (pool.add(_grouped(x).numpy()) for x in (unit, zero))
+    record["last_cosine"] = math.cos(btf.lights.last)
+    return record
+
+
+def _as_codes(x: Float[Tensor, "n rank 3"], *, codes: bool) -> tuple[Tensor, Tensor, Tensor]:
+    """Return `x` as bytes, where `codes`, and its scale and offset: an eighth of a percent of its range is enough.
+
+    What is read four times per pixel is then a quarter as long, like the maps themselves.
+    """
+    if not codes:
+        return x, torch.ones_like(x[0]), torch.zeros_like(x[0])
+    low, high = x.amin(0), x.amax(0)
+    scale = ((high - low) / 255).clamp(min=1e-30)
+    return ((x - low) / scale).round().clamp(0, 255).to(torch.uint8), scale, low
+
+
+def _level_records(btf: EigenBtf, rows: list[int]) -> Int32[np.ndarray, "level 4"]:
+    """Return first vectors in the maps and in the ambient maps, height and width of each level."""
+    groups = -(-btf.rank // GROUP)
+    sizes = [tuple(x.shape[1:3]) for x in btf.levels]
+    first = groups * np.cumsum([0, *rows[:-1]])
+    ambient = groups * np.cumsum([0, *(h * w for h, w in sizes[:-1])])
+    return np.stack([first, ambient, *np.array(sizes).T], 1).astype(np.int32)
+
+
+def _pictures(pool: "_Pool", looks: Textured) -> np.ndarray:
+    record = np.zeros(1, REFLECTANCE)
+    record["there"], record["normals"] = TEXTURED, -1
+    record["maps"], record["levels"], record["level_count"] = _levels_of_four(pool, looks.albedo_levels)
+    if looks.normal_levels is not None:
+        found = _levels_of_four(pool, looks.normal_levels)
+        record["normals"], record["normal_levels"], record["normal_level_count"] = found
+    return record
+
+
+def _levels_of_four(pool: "_Pool", levels: list[Float[Tensor, "H W 3"]]) -> tuple[int, int, int]:
+    """Return where a pyramid's pictures begin, one behind the other, and where their sizes stand; and their number."""
+    sizes = [tuple(x.shape[:2]) for x in levels]
+    first = np.cumsum([0, *(h * w for h, w in sizes[:-1])])
+    pixels = torch.cat([x.flatten(0, 1) for x in levels]).float()
+    records = np.stack([first, first, *np.array(sizes).T], 1).astype(np.int32)
+    return pool.add(torch.nn.functional.pad(pixels, (0, 1)).numpy()), pool.add(records), len(levels)
+
+
+def _bounds(btf: EigenBtf, weights: Float[Tensor, "view rank"]) -> Float[Tensor, "view group"]:
+    """Return the most each group of components can add to T, for the weights of a view."""
+    codes = btf.maps.flatten(0, 2)
+    low, high = codes.amin(0).float(), codes.amax(0).float()
+    ends = torch.stack([btf.offset + btf.scale * low, btf.offset + btf.scale * high]).abs()
+    each = weights.abs() * ends.amax((0, 2)).float()
+    padded = torch.zeros(len(each), -(-btf.rank // GROUP) * GROUP)
+    padded[:, : btf.rank] = each
+    return padded.reshape(len(each), -1, GROUP).sum(-1)
+
+
+def _grouped(x: Tensor) -> Tensor:
+    """Return (..., rank, 3) as (..., group, 16): four components of rgb and nothing in a vector."""
+    *batch, rank, _ = x.shape
+    groups = -(-rank // GROUP)
+    padded = torch.zeros(*batch, groups * GROUP, 4, dtype=x.dtype)
+    padded[..., :rank, :3] = x
+    return padded.reshape(*batch, groups, 16)
+
+
+def _mdf(pool: "_Pool", mdf: Mdf) -> np.ndarray:
+    record = np.zeros(1, MDF)
+    delta = hemisphere.with_pole(mdf.delta, mdf.directions)
+    paired = torch.stack([delta, delta[_next_in_ring(mdf.directions)]], -1)
+    relief = mdf.relief
+    record["there"], record["height"], record["width"] = 1, *mdf.texels
+    record["rings"], record["ring_count"] = pool.add(_rings(mdf.directions)), _ring_count(mdf.directions)
+    record["delta"] = pool.add(paired.numpy())
+    missing = None if mdf.no_hit is None else hemisphere.with_pole(mdf.no_hit.float(), mdf.directions)
+    record["missing"] = -1 if missing is None else pool.add(missing.numpy())
+    record["relief_height"], record["relief_width"] = relief.drop.shape
+    codes = (relief.drop / relief.h * RELIEF_CODES).round().numpy().astype(np.uint16)
+    record["relief"] = pool.add(np.concatenate([codes, codes[:, :1]], 1))
+    record["plateau"] = pool.add(_plateaus(codes, (mdf.delta == 0).all(0).numpy()))
+    record["hole"] = -1 if relief.hole is None else pool.add(relief.hole.float().numpy())
+    record["h"], record["delta_max"] = mdf.h, mdf.delta_max
+    return record
+
+
+def _plateaus(codes: UInt16[np.ndarray, "H4 W4"], top: Bool[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W"]:
+    """Return whether a texel and two all around it lie at the reference plane, in the relief and in every view."""
+    height, width = top.shape
+    flat = top & (codes.reshape(height, codes.shape[0] // height, width, -1) == 0).all((1, 3))
+    for axis in (0, 1):
+        flat = np.logical_and.reduce([np.roll(flat, k, axis) for k in range(-2, 3)])
+    return flat.astype(np.uint8)
+
+
+def _rings(directions: DirectionSet) -> Float[np.ndarray, "ring 8"]:
+    """Return theta, size, phi0, first node, and whether all rings but the pole are alike."""
+    rings = hemisphere.rings(directions)
+    table = np.zeros((len(rings.theta), 8), np.float32)
+    table[:, :4] = torch.stack([x.float() for x in rings], -1).numpy()
+    outer = table[1:]
+    steps = np.arange(len(outer)) * outer[:1, 1]
+    table[:, 4] = bool((outer[:, 1:3] == outer[:1, 1:3]).all() and (outer[:, 3] == outer[:1, 3] + steps).all())
+    return table
+
+
+def _next_in_ring(directions: DirectionSet) -> Int[Tensor, "node"]:
+    """Return, for each node, the next one of its ring."""
+    rings = hemisphere.rings(directions)
+    following = torch.zeros(directions.n_nodes, dtype=torch.long)
+    for size, offset in zip(rings.size.tolist(), rings.offset.tolist(), strict=True):
+        following[offset : offset + size] = offset + (torch.arange(size) + 1) % size
+    return following
+
+
+def _ring_count(directions: DirectionSet) -> int:
+    return len(hemisphere.rings(directions).theta)
+
+
+class _Pool:
+    """Arrays one behind the other, each on a block of its own."""
+
+    def __init__(self) -> None:
+        self._arrays: list[np.ndarray] = []
+        self._blocks = 0
+
+    def add(self, x: np.ndarray) -> int:
+        """Return the block `x` will begin on."""
+        first = self._blocks
+        self._arrays.append(x)
+        self._blocks += -(-x.nbytes // BLOCK)
+        return first
+
+    def joined(self) -> np.ndarray:
+        """Return all arrays as bytes."""
+        whole, at = np.zeros(max(self._blocks, 1) * BLOCK, np.uint8), 0
+        for x in self._arrays:
+            whole[at : at + x.nbytes] = np.ascontiguousarray(x).reshape(-1).view(np.uint8)
+            at += -(-x.nbytes // BLOCK) * BLOCK
+        self._arrays.clear()
+        return whole
