@@ -14,7 +14,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from torchmeso import config, quality
-from torchmeso.bench import colour, limits, minify, peers, scenes, speed
+from torchmeso.bench import colour, limits, million, minify, peers, scenes, speed
 from torchmeso.bench.peers import PeerMissing
 from torchmeso.bench.suite import Context, Measurement, Row
 from torchmeso.bench.timing import Timing, time_together
@@ -338,6 +338,7 @@ MEASUREMENTS = [
     Measurement("mdf", mdf),
     Measurement("frame", speed.frame),
     Measurement("growth", speed.growth),
+    Measurement("million", million.million),
     Measurement("minify", minify.minify),
     Measurement("limits", limits.limits),
     Measurement("compiled", speed.compiled),
