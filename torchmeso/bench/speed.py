@@ -218,10 +218,11 @@ def updates(context: Context) -> Iterator[Row]:
     body, options = scene.objects[0], FrameOptions(shadow_map_size=MAP)
     btf, sun, steps = body.material.btf, scene.lights[0], itertools.count(1)
     assert isinstance(btf, EigenBtf)
+    others = itertools.cycle([replace(body.material, btf=replace(btf)) for _ in range(2)])
     assert isinstance(sun, DirectionalLight)
     changes: dict[str, Callable[[], Scene]] = {
         "mesh": lambda: replace(scene, objects=(replace(body, mesh=replace(body.mesh)),)),
-        "material": lambda: replace(scene, objects=(replace(body, material=replace(body.material, btf=replace(btf))),)),
+        "material": lambda: replace(scene, objects=(replace(body, material=next(others)),)),
         "light": lambda: replace(scene, lights=(replace(sun, irradiance=next(steps) * sun.irradiance),)),
         "nothing": lambda: scene,
     }
