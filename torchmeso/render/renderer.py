@@ -227,6 +227,9 @@ class Renderer:
 
     def _room(self, camera: Camera, lights: tuple[Light, ...]) -> "tuple[_Maps | None, _Picture]":
         """Return where shadow maps and picture are drawn; the same as before where their sizes are."""
+        guess = camera.width * camera.height // 64  # a stamp in four is deeper than it begins with
+        if guess > self._extra:
+            self._extra, self._lists, self._picture, self._maps = guess, None, None, None
         wanted = ()
         if self.options.shadows:
             wanted = tuple(tuple(shadow_map.sizes(light, self.options.shadow_map_size)) for light in lights)
