@@ -79,9 +79,9 @@ def test_a_compiler_that_is_missing_or_fails_is_said(monkeypatch):
     with pytest.raises(PeerMissing, match=r"no C\+\+ compiler; install g\+\+"):
         peers.compiled_torch(n=1)
     monkeypatch.setattr(shutil, "which", lambda name: name)
-    failed = subprocess.CompletedProcess([], -6, "", "first line\nindex out of bounds\n")
+    failed = subprocess.CompletedProcess([], -6, "", "first line\nwhat(): /a/b/c.cpp:7, index out of bounds\n")
     monkeypatch.setattr(subprocess, "run", lambda *a, **k: failed)
-    with pytest.raises(PeerMissing, match=r"ended with status -6 \(index out of bounds\)"):
+    with pytest.raises(PeerMissing, match=r"ended with status -6 \(what\(\): c.cpp:7, index out of bounds\)"):
         peers.compiled_torch(n=1)
     fine = subprocess.CompletedProcess([], 0, 'noise\n{"ms": [3.0, 2.0], "compiling": 40.5}\n', "")
     monkeypatch.setattr(subprocess, "run", lambda *a, **k: fine)
