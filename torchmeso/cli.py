@@ -7,6 +7,7 @@ Test: tests/test_cli.py
 """
 
 import json
+import logging
 import sys
 import warnings
 from collections.abc import Iterator
@@ -36,6 +37,7 @@ class _Group(click.Group):
             click.echo(f"{ctx.info_name} {ctx.invoked_subcommand}: error: {error}", err=True)
             ctx.exit(2)
         except KeyboardInterrupt:
+            logging.getLogger("asyncio").setLevel(logging.CRITICAL)  # Zarr's writes are dropped: that is no news
             click.echo(f"{ctx.info_name} {ctx.invoked_subcommand}: stopped; run it again to go on", err=True)
             ctx.exit(130)
 
