@@ -5,6 +5,7 @@ import torch
 
 from torchmeso.data import image
 from torchmeso.errors import ConfigError
+from torchmeso.geometry.camera import Camera
 from torchmeso.render import film
 from torchmeso.render.film import Picture
 
@@ -42,11 +43,14 @@ def test_the_mean_of_pictures(rng):
     pictures = [replace(picture(rng), seconds={"frame": 1.0}) for _ in range(3)]
     shared = pictures[0].depth.clone()
 
-    def paint(number):
-        shared.copy_(pictures[number].depth)
-        return replace(pictures[number], depth=shared)
+    cameras = [Camera(eye=torch.zeros(3), axes=torch.eye(3), width=3, height=2) for _ in pictures]
 
-    mean = film.average(paint, range(3))
+    def paint(camera):
+        seen = pictures[cameras.index(camera)]
+        shared.copy_(seen.depth)
+        return replace(seen, depth=shared)
+
+    mean = film.average(paint, cameras)
     torch.testing.assert_close(mean.rgb, torch.stack([p.rgb for p in pictures]).mean(0))
     assert torch.equal(mean.depth, pictures[0].depth)
     assert mean.seconds == {"frame": 3.0}

@@ -148,7 +148,7 @@ class EigenBtf:
         return (E * self.view_weights(wo).unsqueeze(-1)).sum(-2)
 
     @cached_property
-    def levels(self) -> list[Shaped[Tensor, "light H2 W2 rank 3"]]:
+    def levels(self) -> list[Shaped[Tensor, "light _ _ rank 3"]]:
         """The maps, and their means over ever more texels."""
         return pyramid.build(self.maps, 1)
 
@@ -162,7 +162,7 @@ class EigenBtf:
         return hemisphere.with_pole(self.weights, self.views)
 
     @cached_property
-    def ambient_maps(self) -> list[Float[Tensor, "H2 W2 rank 3"]]:
+    def ambient_maps(self) -> list[Float[Tensor, "_ _ rank 3"]]:
         """E integrated over the light hemisphere, over pi; each level of the pyramid."""
         share = (hemisphere.quadrature(self.lights) / math.pi).to(self.scale.dtype)
         total = torch.zeros(self.maps.shape[1:], dtype=self.scale.dtype)

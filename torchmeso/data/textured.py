@@ -33,7 +33,7 @@ class Textured:
     """
 
     albedo: Float[Tensor, "H W 3"]
-    normals: Float[Tensor, "H2 W2 3"] | None = None
+    normals: Float[Tensor, "_ _ 3"] | None = None
 
     def __post_init__(self) -> None:
         """Raise ShapeError unless these are pictures."""
@@ -69,12 +69,12 @@ class Textured:
         return normalize(_look_up(self.normal_levels, uv, seen))
 
     @cached_property
-    def albedo_levels(self) -> list[Float[Tensor, "H2 W2 3"]]:
+    def albedo_levels(self) -> list[Float[Tensor, "_ _ 3"]]:
         """The colours, and their means over ever more texels."""
         return pyramid.build(self.albedo, 0)
 
     @cached_property
-    def normal_levels(self) -> list[Float[Tensor, "H2 W2 3"]] | None:
+    def normal_levels(self) -> list[Float[Tensor, "_ _ 3"]] | None:
         """The normals, likewise."""
         return None if self.normals is None else pyramid.build(normalize(self.normals), 0)
 

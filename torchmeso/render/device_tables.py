@@ -163,7 +163,7 @@ def _join(
     return tables, parts
 
 
-def _placed(part: _Part) -> np.ndarray:
+def _placed(part: _Part) -> np.void:
     """Return a part's record with addresses counted from the beginning of all tables."""
     record = part.record.copy()
     for name in ADDRESSES[record.dtype]:
@@ -240,7 +240,7 @@ def _pictures(pool: "_Pool", looks: Textured) -> np.ndarray:
     return record
 
 
-def _levels_of_four(pool: "_Pool", levels: list[Float[Tensor, "H W 3"]]) -> tuple[int, int, int]:
+def _levels_of_four(pool: "_Pool", levels: list[Float[Tensor, "_ _ 3"]]) -> tuple[int, int, int]:
     """Return where a pyramid's pictures begin, one behind the other, and where their sizes stand; and their number."""
     sizes = [tuple(x.shape[:2]) for x in levels]
     first = np.cumsum([0, *(h * w for h, w in sizes[:-1])])
