@@ -50,7 +50,12 @@ def test_equals_bisection(degree, rng):
 def test_every_vector_keeps_its_bound_and_no_less(degree, dtype, rng):
     f = factors(degree)
     beta = torch.rand(4000, 81, dtype=dtype, generator=rng) ** torch.linspace(0.2, 30, 4000, dtype=dtype)[:, None]
-    energy = 2 * math.pi * beta.square().mean(-1) * torch.logspace(-3, 9, 4000, dtype=dtype)[torch.randperm(4000, generator=rng)]
+    energy = (
+        2
+        * math.pi
+        * beta.square().mean(-1)
+        * torch.logspace(-3, 9, 4000, dtype=dtype)[torch.randperm(4000, generator=rng)]
+    )
     found = secular.solve(f, beta, energy)
     used = found.c.double().square().sum(-1)
     assert (used <= energy.double() * (1 + 1e-5)).all()
