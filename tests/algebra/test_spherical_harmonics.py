@@ -16,7 +16,7 @@ def rotations(n, rng):
     return Q * torch.linalg.det(Q)[:, None, None]
 
 
-def by_definition(w, l, m):  # noqa: E741
+def by_definition(w, l, m):
     """Evaluate one function from the associated Legendre polynomial, with 50 digits."""
     mpmath = pytest.importorskip("mpmath")
     with mpmath.workdps(50):
@@ -50,7 +50,7 @@ def test_equals_the_definition(degree, dtype, limit, rng):
     worst = max(
         abs(float(y[i, l * l + l + m]) - by_definition(w[i].double(), l, m))
         for i in range(len(w))
-        for l in sorted({degree, degree // 2, 1, 0})  # noqa: E741
+        for l in sorted({degree, degree // 2, 1, 0})
         for m in [*orders, *(-k for k in orders)]
         if abs(m) <= l
     )

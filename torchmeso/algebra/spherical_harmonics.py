@@ -101,7 +101,7 @@ def _sectoral(m: int) -> float:
     return math.sqrt((2 * m + 1) / (4 * math.pi) * product * (2 if m else 1))
 
 
-def _step(l: int, m: int) -> tuple[float, float]:  # noqa: E741
+def _step(l: int, m: int) -> tuple[float, float]:
     """Return a, b of P_l^m = a (z P_(l-1)^m - b P_(l-2)^m)."""
     a = math.sqrt((4 * l * l - 1) / (l * l - m * m))
     return a, math.sqrt(((l - 1) ** 2 - m * m) / (4 * (l - 1) ** 2 - 1))
@@ -122,7 +122,7 @@ def hemisphere_matrix(degree: int) -> Float[Tensor, "n n"]:
 def project(
     f: Float[Tensor, "*batch sample"], w: Float[Tensor, "sample 3"], solid_angle: Float[Tensor, "sample"], degree: int
 ) -> Float[Tensor, "*batch n"]:
-    """Return c_i = sum over samples of f(w) y_i(w) d omega: the `sphere_projection` of samples that cover the sphere."""
+    """Return c_i = sum of f(w) y_i(w) d omega: the `sphere_projection` of samples that cover the sphere."""
     return f @ (solid_angle[:, None] * basis(w, degree)).to(f.dtype)
 
 
@@ -177,8 +177,8 @@ def _turn_z(c: Float[Tensor, "*#batch n"], angle: Float[Tensor, "*#batch"]) -> F
 @lru_cache(maxsize=8)
 def _orders(degree: int) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"]]:
     """Return the order m of every coefficient and the place of its partner -m."""
-    l_and_m = [(l, m) for l in range(degree + 1) for m in range(-l, l + 1)]  # noqa: E741
-    return torch.tensor([m for _, m in l_and_m]), torch.tensor([l * l + l - m for l, m in l_and_m])  # noqa: E741
+    l_and_m = [(l, m) for l in range(degree + 1) for m in range(-l, l + 1)]
+    return torch.tensor([m for _, m in l_and_m]), torch.tensor([l * l + l - m for l, m in l_and_m])
 
 
 @lru_cache(maxsize=8)
@@ -190,7 +190,7 @@ def _quarter_turn(degree: int) -> Float[Tensor, "n n"]:
     w, weight = _quadrature(degree, -1.0)
     x, y, z = w.unbind(-1)
     J = basis(w, degree).mT @ (weight[:, None] * basis(torch.stack([x, z, -y], -1), degree))
-    degrees = torch.tensor([l for l in range(degree + 1) for _ in range(2 * l + 1)])  # noqa: E741
+    degrees = torch.tensor([l for l in range(degree + 1) for _ in range(2 * l + 1)])
     return torch.where(degrees[:, None] == degrees, J, 0)
 
 

@@ -188,7 +188,7 @@ def _hemisphere_points(last: float, degree: int) -> tuple[Tensor, Tensor]:
 
 def bands(terms: int) -> list[slice]:
     """Return the coefficients of each band l = 0, 1, ...: 2 l + 1 of them."""
-    return [slice(l * l, (l + 1) ** 2) for l in range(degree_of(terms) + 1)]  # noqa: E741
+    return [slice(l * l, (l + 1) ** 2) for l in range(degree_of(terms) + 1)]
 
 
 def save(model: ShBtf, path: str | Path, *, silhouette: Mdf | None = None, **meta: object) -> None:
