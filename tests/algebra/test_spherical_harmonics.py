@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from torchmeso.algebra import spherical_harmonics as sh
-from torchmeso.errors import ConfigError, ShapeError
+from torchmeso.errors import BackendError, ConfigError, ShapeError
 
 
 def directions(n, rng, dtype=torch.float64):
@@ -126,8 +126,32 @@ def test_a_mirror(rng):
     torch.testing.assert_close(sh.basis(w, 4) @ sh.mirror_y(c), sh.basis(flipped, 4) @ c, rtol=0, atol=1e-13)
 
 
+@pytest.mark.parametrize("degree", [0, 1, 5, 20])
+@pytest.mark.parametrize("n", [0, 1, 16, 77])
+def test_opencl_is_the_formula(degree, n, rng, device):
+    w = directions(2 * n, rng, torch.float32)[::2]
+    found = sh.basis(w, degree, backend="opencl")
+    torch.testing.assert_close(found.double(), sh.basis(w.double(), degree), rtol=0, atol=2e-6 if degree < 6 else 1e-4)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 5, 20])
+def test_opencl_rotates_as_the_formula(degree, rng, device):
+    R = rotations(37, rng)
+    R[0], R[1] = torch.eye(3), torch.diag(torch.tensor([1.0, -1, -1]))
+    c = torch.randn(37, sh.size(degree), generator=rng)
+    exact = sh.rotate(c.double(), R)
+    torch.testing.assert_close(sh.rotate(c, R.float(), backend="opencl").double(), exact, rtol=0, atol=2e-5)
+    one = sh.rotate(c, R[5].float(), backend="opencl")
+    torch.testing.assert_close(one.double(), sh.rotate(c.double(), R[5]), rtol=0, atol=2e-5)
+    assert sh.rotate(c[:0], R[5].float(), backend="opencl").shape == (0, sh.size(degree))
+
+
 @pytest.mark.errors
 def test_refusals():
+    with pytest.raises(BackendError, match="expected float32 on opencl"):
+        sh.rotate(torch.zeros(4).double(), torch.eye(3), backend="opencl")
+    with pytest.raises(BackendError, match="expected float32 on opencl"):
+        sh.basis(torch.eye(3).double(), 2, backend="opencl")
     with pytest.raises(ConfigError, match="degree: expected a value from 0 to 20, got 21"):
         sh.basis(torch.eye(3), 21)
     with pytest.raises(ShapeError, match=r"expected directions \(\.\.\., 3\), got \(2, 2\)"):

@@ -11,20 +11,25 @@ with P normalised and free of powers of sin(theta), so nothing divides by zero a
 A rotation acts on a coefficient vector as Z(alpha) J^T Z(beta) J Z(gamma): three diagonal rotations about z
 and the constant matrix J of a quarter turn about x. No matrix of a rotation is ever formed.
 
-Test: tests/algebra/test_spherical_harmonics.py
+Kernel: kernels_cl/algebra/spherical_harmonics.cl          Test: tests/algebra/test_spherical_harmonics.py
 """
 
 import math
 from functools import lru_cache
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchmeso.errors import ConfigError, ShapeError, check_range
+from torchmeso.backends import BackendChoice, opencl
+from torchmeso.errors import BackendError, ConfigError, ShapeError, check_range
 
 BLOCK = 8192
 """Directions at a time: their basis stays in a core's cache."""
+
+PER_ITEM = 64
+"""Directions of a work-item: as in the kernel."""
 
 MAX_DEGREE = 20
 """Highest degree; the recurrence is tested to here in float32 and float64."""
@@ -55,10 +60,16 @@ def degree_of(coefficients: int) -> int:
     return degree
 
 
-def basis(w: Float[Tensor, "*batch 3"], degree: int) -> Float[Tensor, "*batch n"]:
+def basis(w: Float[Tensor, "*batch 3"], degree: int, *, backend: BackendChoice = "torch") -> Float[Tensor, "*batch n"]:
     """Return the basis functions y_i(w), i = l^2 + l + m, for unit directions w.
 
+    Args:
+        w: unit directions; float32 on opencl.
+        degree: highest l, at most 20.
+        backend: torch is differentiable and runs in float64.
+
     Raises:
+        BackendError: w wants a gradient or is not float32, on opencl.
         ConfigError: degree is not in 0..20.
         ShapeError: the last axis of w is not 3.
     """
@@ -66,12 +77,41 @@ def basis(w: Float[Tensor, "*batch 3"], degree: int) -> Float[Tensor, "*batch n"
     if w.shape[-1:] != (3,):
         raise ShapeError(f"spherical harmonics: expected directions (..., 3), got {tuple(w.shape)}")
     flat = w.reshape(-1, 3)
+    if opencl.resolve(backend) == "opencl":
+        return _basis_opencl(flat, degree).reshape(*w.shape[:-1], n)
     if w.requires_grad:
         return torch.stack(_rows(flat, degree), -1).reshape(*w.shape[:-1], n)
     out = w.new_empty(len(flat), n)
     for part, place in zip(flat.split(BLOCK), out.split(BLOCK), strict=True):
         torch.stack(_rows(part, degree), -1, out=place)
     return out.reshape(*w.shape[:-1], n)
+
+
+def _basis_opencl(w: Float[Tensor, "k 3"], degree: int) -> Float[Tensor, "k n"]:
+    if w.dtype != torch.float32:
+        raise BackendError(f"spherical harmonics: expected float32 on opencl, got {w.dtype}; use backend='torch'")
+    out = torch.empty(len(w), size(degree))
+    if not len(w):
+        return out
+    source = _aligned(w)
+    device, device_out = opencl.buffer(source), opencl.buffer(out)
+    run = opencl.kernel("algebra/spherical_harmonics.cl", "basis")
+    groups = -(-len(w) // PER_ITEM)
+    run(opencl.queue(), (groups,), (1,), steps(degree), np.int32(degree), device, np.int32(len(w)), device_out)
+    opencl.read([(device_out, out)])
+    return out
+
+
+@lru_cache(maxsize=8)
+def steps(degree: int) -> "opencl.Buffer":
+    """Return the numbers of the recurrence on the device: for each m P_m^m, then two factors for each l > m."""
+    numbers: list[float] = []
+    for m in range(degree + 1):
+        numbers.append(_sectoral(m))
+        for l in range(m + 1, degree + 1):
+            a, b = _step(l, m)
+            numbers += [a, -a * b]
+    return opencl.upload(np.array(numbers, np.float32))
 
 
 def _rows(w: Float[Tensor, "k 3"], degree: int) -> list[Float[Tensor, "k"]]:
@@ -126,24 +166,63 @@ def project(
     return f @ (solid_angle[:, None] * basis(w, degree)).to(f.dtype)
 
 
-def rotate(c: Float[Tensor, "*#batch n"], rotation: Float[Tensor, "*#batch 3 3"]) -> Float[Tensor, "*batch n"]:
+def rotate(
+    c: Float[Tensor, "*#batch n"], rotation: Float[Tensor, "*#batch 3 3"], *, backend: BackendChoice = "torch"
+) -> Float[Tensor, "*batch n"]:
     """Return the coefficients of the turned function, f'(w) = f(R^T w): a lobe along w then lies along R w.
 
     Args:
         c: coefficients up to any degree <= 20.
         rotation: orthonormal, determinant +1. A left-handed frame is a rotation after `mirror_y`.
+        backend: torch is differentiable and runs in float64.
 
     Raises:
+        BackendError: c wants a gradient or is not float32, on opencl.
         ConfigError: the number of coefficients is not a square.
         ShapeError: `rotation` is not (..., 3, 3).
     """
     degree = degree_of(c.shape[-1])
     if rotation.shape[-2:] != (3, 3):
         raise ShapeError(f"spherical harmonics: expected rotations (..., 3, 3), got {tuple(rotation.shape)}")
+    if opencl.resolve(backend) == "opencl":
+        return _rotate_opencl(c, rotation, degree)
     alpha, beta, gamma = _euler(rotation.to(c.dtype))
     J = _quarter_turn(degree).to(c.dtype)
     turned = _turn_z(c, gamma) @ J.mT
     return _turn_z(_turn_z(turned, beta) @ J, alpha)
+
+
+def _rotate_opencl(c: Tensor, rotation: Tensor, degree: int) -> Tensor:
+    if c.dtype != torch.float32:
+        raise BackendError(f"spherical harmonics: expected float32 on opencl, got {c.dtype}; use backend='torch'")
+    batch = torch.broadcast_shapes(c.shape[:-1], rotation.shape[:-2])
+    each = int(rotation[..., 0, 0].numel() > 1)
+    R = rotation.float().expand(*batch, 3, 3) if each else rotation.float()
+    source, turns = (_aligned(x) for x in (c.expand(*batch, -1), R))
+    out = torch.empty(*batch, c.shape[-1])
+    count = batch.numel()
+    if not count:
+        return out
+    device, device_turns, device_out = (opencl.buffer(x) for x in (source, turns, out))
+    run = opencl.kernel("algebra/spherical_harmonics.cl", "rotate_vectors")
+    J = _quarter_turn_on_device(degree)
+    arguments = J, np.int32(degree), device_turns, np.int32(each), device, np.int32(count), device_out
+    run(opencl.queue(), (-(-count // PER_ITEM),), (1,), *arguments)
+    opencl.read([(device_out, out)])
+    return out
+
+
+def _aligned(x: Tensor) -> Tensor:
+    """Return x as a device can share it: contiguous, on a border of 64 bytes."""
+    return x if x.is_contiguous() and x.data_ptr() % 64 == 0 else x.contiguous().clone()
+
+
+@lru_cache(maxsize=8)
+def _quarter_turn_on_device(degree: int) -> "opencl.Buffer":
+    """Return J's blocks for l = 0, 1, ..., one behind the other."""
+    J = _quarter_turn(degree).float()
+    blocks = [J[l * l : (l + 1) ** 2, l * l : (l + 1) ** 2].flatten() for l in range(degree + 1)]
+    return opencl.upload(torch.cat(blocks).numpy())
 
 
 def mirror_y(c: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n"]:
@@ -196,8 +275,6 @@ def _quarter_turn(degree: int) -> Float[Tensor, "n n"]:
 
 def _quadrature(degree: int, lowest: float) -> tuple[Float[Tensor, "point 3"], Float[Tensor, "point"]]:
     """Return points and weights, z in [lowest, 1], exact for products of two functions up to `degree`."""
-    import numpy as np
-
     nodes, weights = (torch.from_numpy(a) for a in np.polynomial.legendre.leggauss(degree + 1))
     z = lowest + (nodes + 1) * ((1 - lowest) / 2)
     steps = 2 * degree + 1

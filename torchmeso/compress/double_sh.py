@@ -134,7 +134,7 @@ def fit(
         c = project(samples, light, view, backend=backend).flatten(0, 1)
         found[:, rows] = _in_half(c, f"rows {rows.start} to {rows.stop - 1}").unflatten(1, (-1, width * 3))
         progress(0.9 * rows.stop / height)
-    maps, scale, offset = _quantised(found.unflatten(2, (width, 3)), options.storage)
+    maps, scale, offset = quantised(found.unflatten(2, (width, 3)), options.storage)
     progress(1.0)
     terms = light.terms, view.terms
     return ShBtf(
@@ -258,7 +258,7 @@ def _in_half(c: Float[Tensor, "k column"], where: str) -> Float[Tensor, "k colum
     return half
 
 
-def _quantised(found: Float[Tensor, "k H W 3"], storage: Storage) -> tuple[Tensor, Tensor, Tensor]:
+def quantised(found: Float[Tensor, "k H W 3"], storage: Storage) -> tuple[Tensor, Tensor, Tensor]:
     """Return codes, scale and offset of every coefficient and channel."""
     parts = [quantize(c.float()[..., None, :], storage) for c in found]
     return tuple(torch.stack([getattr(p, name).squeeze(-2) for p in parts]) for name in ("codes", "scale", "offset"))
