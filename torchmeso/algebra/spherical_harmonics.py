@@ -19,7 +19,7 @@ from functools import lru_cache
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Float32, Int
 from torch import Tensor
 
 from torchmeso.backends import BackendChoice, opencl
@@ -97,21 +97,25 @@ def _basis_opencl(w: Float[Tensor, "k 3"], degree: int) -> Float[Tensor, "k n"]:
     device, device_out = opencl.buffer(source), opencl.buffer(out)
     run = opencl.kernel("algebra/spherical_harmonics.cl", "basis")
     groups = -(-len(w) // PER_ITEM)
-    run(opencl.queue(), (groups,), (1,), steps(degree), np.int32(degree), device, np.int32(len(w)), device_out)
+    run(opencl.queue(), (groups,), (1,), _steps(degree), np.int32(degree), device, np.int32(len(w)), device_out)
     opencl.read([(device_out, out)])
     return out
 
 
 @lru_cache(maxsize=8)
-def steps(degree: int) -> "opencl.Buffer":
-    """Return the numbers of the recurrence on the device: for each m P_m^m, then two factors for each l > m."""
+def _steps(degree: int) -> "opencl.Buffer":
+    return opencl.upload(recurrence(degree))
+
+
+def recurrence(degree: int) -> Float32[np.ndarray, "number"]:
+    """Return the numbers of the recurrence as kernels read them: for each m P_m^m, then two factors for each l > m."""
     numbers: list[float] = []
     for m in range(degree + 1):
         numbers.append(_sectoral(m))
         for l in range(m + 1, degree + 1):
             a, b = _step(l, m)
             numbers += [a, -a * b]
-    return opencl.upload(np.array(numbers, np.float32))
+    return np.array(numbers, np.float32)
 
 
 def _rows(w: Float[Tensor, "k 3"], degree: int) -> list[Float[Tensor, "k"]]:

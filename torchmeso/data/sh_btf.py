@@ -114,7 +114,7 @@ class ShBtf:
         self, uv: Float[Tensor, "*batch 2"], wo: Float[Tensor, "*batch 3"], seen: Footprint | None = None
     ) -> Float[Tensor, "*batch 3"]:
         """Return L_a(uv, wo) = (1/pi) times the integral of T over the light hemisphere (white: 1)."""
-        light = self._everywhere.to(wo.dtype).expand(*wo.shape[:-1], -1)
+        light = self.everywhere.to(wo.dtype).expand(*wo.shape[:-1], -1)
         return self._summed(uv, light, wo, seen, most=1)
 
     def decoded(self) -> Float[Tensor, "k_l k_v H W 3"]:
@@ -155,7 +155,7 @@ class ShBtf:
         return [x.flatten(0, 1).flatten(1, 2).movedim(0, 1).contiguous() for x in self.levels]
 
     @cached_property
-    def _everywhere(self) -> Float[Tensor, "k_l"]:
+    def everywhere(self) -> Float[Tensor, "k_l"]:
         """Each harmonic of the light, held and falling off as in `evaluate`, over the hemisphere and pi."""
         w, weight = _hemisphere_points(self.lights.last, degree_of(self.terms[0]))
         values = _held_basis(self.lights, w, self.terms[0]) * horizon_falloff(self.lights, w)
