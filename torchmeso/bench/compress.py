@@ -12,12 +12,16 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from torchmeso.algebra import gram, secular
+from torchmeso.algebra.spherical_harmonics import basis
 from torchmeso.bench import harmonics
 from torchmeso.bench.suite import Context, Measurement, Row
 from torchmeso.bench.timing import time_together
 from torchmeso.compress import double_sh
+from torchmeso.compress import eigen as eigen_fit
 from torchmeso.compress.double_sh import DoubleShOptions, Side
 from torchmeso.geometry import hemisphere
+from torchmeso.meso import bake_btf, generators
+from torchmeso.meso.bake_btf import BtfOptions
 
 PAPER_SECONDS = {(128, 25): 613, (128, 36): 761, (256, 25): 1067, (256, 36): 1251}
 """leung2007tileable, Table II: side of the texture, view coefficients; 25 of the light; a Pentium IV of 3.2 GHz."""
@@ -146,8 +150,8 @@ def eigen(context: Context) -> Iterator[Row]:
     A += 1e-3 * torch.randn(rows, columns, generator=generator)
 
     def ours() -> Tensor:
-        basis = gram.right_basis(gram.gram([A], columns), rank).vectors.float()
-        return A @ basis @ basis.T
+        W = gram.right_basis(gram.gram([A], columns), rank).vectors.float()
+        return A @ W @ W.T
 
     start = time.perf_counter()
     torch.linalg.svd(A, full_matrices=False)
@@ -170,6 +174,34 @@ def eigen(context: Context) -> Iterator[Row]:
         id="compress.eigen.streamed", what="largest difference of the Gram matrix, in memory and in blocks",
         value=float((whole - parts).abs().max()), unit="", better="lower", goal=0.0,
     )  # fmt: skip
+
+
+def rate(context: Context) -> Iterator[Row]:
+    """Error over size on a baked material: double SH over the dial of its energy, and eigen BTFs over their rank."""
+    options = BtfOptions(texels=16 if context.quick else 32, lights="ubo81", views="ubo81", samples=1, bounces=0)
+    table = bake_btf.in_memory(generators.brick(), options)
+    T = table.pictures().float()
+    peak = float(torch.quantile(T.flatten()[::97], 0.995))
+    y = basis(hemisphere.ubo81().directions(), 4)
+
+    def row(name: str, place: str, shown: Tensor, bytes_per_texel: int) -> Row:
+        error = float((shown - T).square().mean())
+        return Row(
+            id=f"compress.rate.brick.{name}.{place}",
+            what=f"PSNR of all values of a baked brick BTF, 81 x 81 directions, {name} {place}",
+            value=round(10 * math.log10(peak**2 / error), 2), unit="dB", better="higher",
+            peer=f"{6561 / bytes_per_texel:.1f}:1 of 8-bit values",
+            curve={"series": name, "x": bytes_per_texel / 6561},
+        )  # fmt: skip
+
+    for energy in (0.3, 1.0, 3.0, 10.0, None):
+        model = double_sh.fit(table, DoubleShOptions(energy=energy), backend="auto")
+        shown = torch.einsum("li,vj,ijhwc->lvhwc", y, y, model.decoded())
+        yield row("double-sh", "unbounded" if energy is None else f"{energy:g}", shown, 625)
+    for rank in (1, 2, 4, 8, 16):
+        model = eigen_fit.fit(table, eigen_fit.EigenOptions(rank=rank))
+        shown = torch.einsum("lhwkc,vk->lvhwc", model.decoded(), model.weights)
+        yield row("eigen", str(rank), shown, 81 * rank)
 
 
 def _ratio(id: str, what: str, value: float, better: str, goal: float, n: int, peer: str) -> Row:
@@ -245,7 +277,7 @@ def _bisected(raw: Tensor, light: Side, view: Side) -> Tensor:
         w = (columns @ f.left.float()) * f.values.float()
         return ((w / (s2 + high[..., None])) @ f.right.float().T).movedim(-1, 0)
 
-    return stage(stage(raw.float() * UNIT, light).movedim(1, 0), view)
+    return stage(stage(raw.float() * UNIT, light).movedim(1, 0), view).movedim(1, 0)
 
 
 MEASUREMENTS = (
@@ -253,6 +285,7 @@ MEASUREMENTS = (
     Measurement("compress.cls", constrained),
     Measurement("compress.quantised", quantised),
     Measurement("compress.eigen", eigen),
+    Measurement("compress.rate", rate),
     Measurement("compress.sh", harmonics.basis),
     Measurement("compress.rotation", harmonics.rotation),
 )
