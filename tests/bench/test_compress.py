@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import torch
 
 from torchmeso.bench import compress
@@ -39,10 +41,9 @@ def test_eight_bits(device, monkeypatch):
 
 
 def test_error_over_size(monkeypatch):
-    from dataclasses import replace
-
-    options = compress.BtfOptions
-    monkeypatch.setattr(compress, "BtfOptions", lambda **k: replace(options(**k), texels=12))
+    options, brick = compress.BtfOptions, compress.generators.brick
+    monkeypatch.setattr(compress, "BtfOptions", lambda **k: replace(options(**k), texels=6))
+    monkeypatch.setattr(compress.generators, "brick", lambda: brick(rows=6))
     rows = {row.id.removeprefix("compress.rate.brick."): row.value for row in compress.rate(Context(quick=True))}
     assert rows["eigen.16"] > rows["eigen.4"] > rows["eigen.1"]
     assert rows["double-sh.1"] > rows["double-sh.unbounded"]

@@ -178,7 +178,7 @@ def eigen(context: Context) -> Iterator[Row]:
 
 def rate(context: Context) -> Iterator[Row]:
     """Error over size on a baked material: double SH over the dial of its energy, and eigen BTFs over their rank."""
-    options = BtfOptions(texels=16 if context.quick else 32, lights="ubo81", views="ubo81", samples=1, bounces=0)
+    options = BtfOptions(texels=32, lights="ubo81", views="ubo81", samples=1, bounces=0)
     table = bake_btf.in_memory(generators.brick(), options)
     T = table.pictures().float()
     peak = float(torch.quantile(T.flatten()[::97], 0.995))
