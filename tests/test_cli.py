@@ -61,6 +61,9 @@ def test_from_a_mesostructure_to_a_model(tmp_path):
     assert mdf.load(mdf_path).texels == (16, 16)
     assert run("compress", btf_path, "--rank", 3, "--mdf", mdf_path, "--out", model).exit_code == 0
     assert "rank: 3" in run("info", model).stdout
+    few = ("--light-terms", 4, "--view-terms", 4, "--unbounded", "--mdf", mdf_path, "--out", model, "--force")
+    assert run("compress", btf_path, "--method", "double-sh", *few).exit_code == 0
+    assert "coefficients: 4 x 4 of light and view" in run("info", model).stdout
 
 
 def test_render_and_compare(small, tmp_path):
@@ -105,6 +108,9 @@ REFUSED = [
     (["bake", "--meso", "brick", "--out", "x.btf.zarr", "--lights", "grid(1)"], "expected 'grid(n_phi, n_theta"),
     (["compress", "none.btf.zarr", "--out", "x.meso"], "expected a btf table, found none; bake it first"),
     (["compress", "none.btf.zarr", "--out", "x.zip"], "expected a name that ends in .meso"),
+    (["compress", "a", "--energy", "2", "--out", "x.meso"], "--method eigen has no --energy"),
+    (["compress", "a", "--unbounded", "--out", "x.meso"], "--method eigen has no --unbounded"),
+    (["compress", "a", "--method", "double-sh", "--rank", "3", "--out", "x.meso"], "double-sh has no --rank"),
     (["render", "none.yaml", "--out", "x.png"], "expected a configuration (.yaml), found none"),
     (["render", "small.yaml", "--out", "x.gif"], "expected a name that ends in .png or .exr"),
     (["render", "small.yaml", "--out", "small.yaml.png"], "exists already; give --force"),

@@ -87,6 +87,18 @@ def _model(path: Path) -> dict[str, Any]:
             "storage": str(first.dtype).removeprefix("torch."),
             "BTF data": _held(model, "eigen."),
         }
+    if "sh" in model.meta:
+        sh = model.meta["sh"]
+        first = model.read("sh.map.0.0")
+        about |= {
+            "coefficients": "{} x {} of light and view".format(*sh["terms"]),
+            "domain": sh["domain"],
+            "lights": sh["lights"],
+            "views": sh["views"],
+            "texels": f"{first.shape[3]} x {first.shape[2]}",
+            "storage": str(first.dtype).removeprefix("torch."),
+            "BTF data": _held(model, "sh."),
+        }
     if "mdf" in model.meta:
         about["MDF"] = f"{model.meta['mdf']['directions']}, h = {model.meta['mdf']['h']:g} tiles"
         about["MDF data"] = _held(model, "mdf.")
