@@ -39,9 +39,16 @@ class _Group(click.Group):
             click.echo(f"{ctx.info_name} {ctx.invoked_subcommand}: error: {error}", err=True)
             ctx.exit(2)
         except KeyboardInterrupt:
-            logging.getLogger("asyncio").setLevel(logging.CRITICAL)  # Zarr's writes are dropped: that is no news
+            _drop_what_is_left()
             click.echo(f"{ctx.info_name} {ctx.invoked_subcommand}: stopped; run it again to go on", err=True)
             ctx.exit(130)
+
+
+def _drop_what_is_left() -> None:
+    """Keep Zarr's unfinished writes from complaining while Python ends: that they are dropped is no news."""
+    logging.getLogger("asyncio").setLevel(logging.CRITICAL)
+    warnings.simplefilter("ignore")
+    sys.unraisablehook = lambda *_: None
 
 
 def _say(message: Warning | str, *_: Any) -> None:
