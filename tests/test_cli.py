@@ -10,6 +10,7 @@ import torch
 import yaml
 from click.testing import CliRunner
 
+from tests.data import bonn
 from tests.pipeline.small import CONTENT
 from torchmeso.backends import opencl
 from torchmeso.cli import main
@@ -61,6 +62,18 @@ def test_from_a_mesostructure_to_a_model(tmp_path):
     assert mdf.load(mdf_path).texels == (16, 16)
     assert run("compress", btf_path, "--rank", 3, "--mdf", mdf_path, "--out", model).exit_code == 0
     assert "rank: 3" in run("info", model).stdout
+
+
+def test_from_pictures_to_a_model(tmp_path):
+    names = bonn.write(tmp_path / "set", bonn.codes())
+    (tmp_path / "set" / names[1, 2]).unlink()
+    assert "missing: 1 of 28 (tl040 pl000 tv050 pv140)" in run("info", tmp_path / "set").stdout
+    arguments = "compress", tmp_path / "set", "--rank", 3, "--out", tmp_path / "a.meso"
+    refused = run(*arguments)
+    assert (refused.exit_code, refused.stderr.count("\n")) == (2, 1)
+    assert "pictures are missing: 1 of 28" in refused.stderr
+    assert run(*arguments, "--allow-missing").exit_code == 0
+    assert "views: rings(0: 1, 50: 3 @ 20)" in run("info", tmp_path / "a.meso").stdout
 
 
 def test_render_and_compare(small, tmp_path):

@@ -138,12 +138,23 @@ def _bake_one(meso: str, out: Any, force: bool, options: dict[str, Any]) -> None
     "--storage", default="uint8", show_default=True, type=click.Choice(["uint8", "float16", "float32"]), help="Of maps."
 )
 @click.option("--mdf", "silhouette", help="MDF table (.mdf.zarr) to pack into the model.")
+@click.option("--allow-missing", is_flag=True, help="Interpolate pictures that a folder or zip lacks.")
 @click.option("--out", required=True, help="The run-time model (.meso).")
 @click.option("--force", is_flag=True, help="Replace an existing model.")
-def compress(table: str, method: str, rank: int, storage: Any, silhouette: str | None, out: str, force: bool) -> None:
-    """Compress a BTF TABLE (.btf.zarr) into a run-time model."""
+def compress(
+    table: str,
+    method: str,
+    rank: int,
+    storage: Any,
+    silhouette: str | None,
+    allow_missing: bool,
+    out: str,
+    force: bool,
+) -> None:
+    """Compress a BTF TABLE (.btf.zarr, or a folder or zip of pictures) into a run-time model."""
     from torchmeso.compress import eigen
     from torchmeso.data import btf, eigen_btf, mdf
+    from torchmeso.pipeline import picture_sets
 
     if not out.endswith(".meso"):
         raise ConfigError(f"{out}: expected a name that ends in .meso")
@@ -151,6 +162,8 @@ def compress(table: str, method: str, rank: int, storage: Any, silhouette: str |
     depth = None if silhouette is None else mdf.load(silhouette)
     options = eigen.EigenOptions(rank=rank, storage=storage)
     with _progress() as report:
+        if picture_sets.is_one(table):
+            table = str(picture_sets.as_table(table, report, allow_missing=allow_missing))
         model = eigen.fit(btf.load(table), options, progress=lambda x: report(f"{method} BTF", x))
     eigen_btf.save(model, out, silhouette=depth)
     click.echo(out)

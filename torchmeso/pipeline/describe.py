@@ -9,10 +9,11 @@ from typing import Any
 import torch
 
 from torchmeso import config
-from torchmeso.data import btf, image, mdf, store
+from torchmeso.data import btf, image, mdf, picture_set, store
 from torchmeso.errors import FormatError, human_size
 from torchmeso.geometry import mesh, mesh_file, unwrap
 from torchmeso.geometry.mesh_file import Group
+from torchmeso.pipeline import picture_sets
 
 
 def file(path: str | Path) -> dict[str, Any]:
@@ -29,18 +30,20 @@ def file(path: str | Path) -> dict[str, Any]:
         return _btf(path)
     if name.endswith(".mdf.zarr"):
         return _mdf(path)
+    if picture_sets.is_one(path):
+        return _picture_set(path)
     if name.endswith(".meso"):
         return _model(path)
     if name.endswith((".yaml", ".yml")):
         return _config(path)
-    if name.endswith((".png", ".jpg", ".jpeg", ".exr")):
+    if name.endswith((".png", ".jpg", ".jpeg", ".exr", ".hdr")):
         rgb = image.read(path)
         return {"kind": "picture", "size": f"{rgb.shape[1]} x {rgb.shape[0]}", "largest value": float(rgb.max())}
     if name.endswith((".obj", ".ply", ".glb", ".gltf", ".off", ".stl")):
         return _mesh(path)
     raise FormatError(
         f"{path}: expected a table (.btf.zarr, .mdf.zarr), a model (.meso), a configuration (.yaml), "
-        "a picture or a mesh"
+        "a folder or zip of the pictures of a BTF, a picture or a mesh"
     )
 
 
@@ -53,7 +56,23 @@ def _btf(path: Path) -> dict[str, Any]:
         "views": f"{len(table.views)}, {table.views.name}",
         "texels": f"{table.texels[1]} x {table.texels[0]}",
         "slab depth (tiles)": table.h,
+        **({"filled in": store.attributes(group)["filled"]} if "filled" in store.attributes(group) else {}),
         **_origin(store.attributes(group)),
+        "on disk": _size(path),
+    }
+
+
+def _picture_set(path: Path) -> dict[str, Any]:
+    found = picture_sets.survey(path)
+    height, width = picture_set.size(found)
+    return {
+        "kind": "BTF in pictures",
+        "lights": f"{len(found.lights)}, {found.lights.name}",
+        "views": f"{len(found.views)}, {found.views.name}",
+        "texels": f"{width} x {height}",
+        "values": "sRGB codes" if found.encoding == "srgb" else "linear",
+        "pictures": len(found.files),
+        "missing": found.missing_text(),
         "on disk": _size(path),
     }
 

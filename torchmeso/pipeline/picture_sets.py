@@ -1,0 +1,49 @@
+"""BTFs in pictures as the command line takes them: a folder or a zip, made into a raw table in the cache.
+
+Test: tests/pipeline/test_picture_sets.py
+"""
+
+from pathlib import Path
+
+from torchmeso.data import picture_set, store, ubo2003
+from torchmeso.data.picture_set import PictureSet
+from torchmeso.pipeline.bake import Report, silent
+
+
+def is_one(path: str | Path) -> bool:
+    """Return whether `path` is a folder that is no raw table, or a zip."""
+    path = Path(path)
+    return (path.is_dir() and path.suffix != ".zarr") or path.suffix.lower() == ".zip"
+
+
+def survey(path: str | Path) -> PictureSet:
+    """Return which pictures `path` holds.
+
+    Raises:
+        FormatError: it holds none that are a BTF's.
+    """
+    return ubo2003.survey(path)
+
+
+def as_table(path: str | Path, report: Report = silent, *, allow_missing: bool = False) -> Path:
+    """Return the raw table of the pictures in `path`, made once and kept until one of the files changes.
+
+    Raises:
+        FormatError: a picture is missing (unless `allow_missing`), damaged, or of another size.
+        StorageError: the cache cannot be written to.
+    """
+    pictures = survey(path)
+    if not allow_missing:
+        picture_set.check_complete(pictures)
+    table = store.cache_dir() / f"pictures-{pictures.key}.btf.zarr"
+    if not table.exists():
+        with store.writing(table):
+            table.parent.mkdir(parents=True, exist_ok=True)
+        picture_set.to_table(
+            pictures,
+            table,
+            allow_missing=allow_missing,
+            progress=lambda x: report("pictures", x),
+            source=Path(path).name,
+        )
+    return table
