@@ -14,7 +14,9 @@ from tests.data import bonn
 from tests.pipeline.small import CONTENT
 from torchmeso.backends import opencl
 from torchmeso.cli import main
-from torchmeso.data import image, mdf
+from torchmeso.data import btf, image, mdf
+from torchmeso.data.btf import Btf
+from torchmeso.geometry import hemisphere
 from torchmeso.meso.generators import GENERATORS
 
 
@@ -74,6 +76,17 @@ def test_from_pictures_to_a_model(tmp_path):
     assert "pictures are missing: 1 of 28" in refused.stderr
     assert run(*arguments, "--allow-missing").exit_code == 0
     assert "views: rings(0: 1, 50: 3 @ 20)" in run("info", tmp_path / "a.meso").stdout
+
+
+def test_a_table_is_exported_as_pictures(tmp_path):
+    lights = hemisphere.from_rings((0, 40), (1, 6), (0, 0))
+    table = Btf(images=torch.rand(7, 7, 3, 3, 3), lights=lights, views=lights)
+    btf.save(table, tmp_path / "a.btf.zarr")
+    arguments = "export", tmp_path / "a.btf.zarr", "--to", tmp_path / "stack"
+    assert run(*arguments).stdout.strip() == str(tmp_path / "stack")
+    assert "pictures: 49" in run("info", tmp_path / "stack").stdout
+    assert "exists already; give --force" in run(*arguments).stderr
+    assert run(*arguments, "--force").exit_code == 0
 
 
 def test_render_and_compare(small, tmp_path):

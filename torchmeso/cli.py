@@ -250,12 +250,18 @@ def _render_frames(settings: Any, out: str, truth: bool, force: bool, options: d
 
 @main.command()
 @click.argument("file")
-@click.option("--to", "out", required=True, help="The file to write: .glb (glTF 2.0).")
+@click.option("--to", "out", required=True, help="The file to write: .glb (glTF 2.0); of a BTF a folder of EXR.")
 @click.option("--force", is_flag=True, help="Replace an existing file.")
 def export(file: str, out: str, force: bool) -> None:
-    """Write the mesh FILE, or all objects of a configuration where they stand, with tangents for other renderers."""
+    """Write FILE for other renderers: a mesh or all objects of a configuration, a BTF table as pictures."""
     from torchmeso.pipeline import export as job
 
+    if file.rstrip("/").endswith(".btf.zarr"):
+        _refuse_to_replace(out, force)
+        with _progress() as report:
+            job.to_exr_stack(file, out, report)
+        click.echo(out)
+        return
     if not out.lower().endswith(".glb"):
         raise ConfigError(f"{out}: expected a name that ends in .glb")
     _refuse_to_replace(out, force)

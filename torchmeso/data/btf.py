@@ -113,6 +113,19 @@ class Btf:
             )
         return band
 
+    def seen_from(self, view: int) -> Float[Tensor, "light H W 3"]:
+        """Return the pictures of one view as linear float32, reading no others.
+
+        Raises:
+            FormatError: the file on disk is damaged.
+        """
+        if isinstance(self.images, Tensor):
+            stored = self.images[:, view]
+        else:
+            with store.reading(str(self.images.store_path)):
+                stored = torch.from_numpy(np.asarray(self.images[:, view]))
+        return image.decode_codes(stored) if self.encoding == "srgb" else stored.float()
+
     def pictures(self) -> Float[Tensor, "light view H W 3"]:
         """Return all pictures, read into memory: in the dtype they are stored in, of codes the linear float32 values.
 

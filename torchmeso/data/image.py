@@ -19,6 +19,9 @@ from torchmeso.errors import FormatError, StorageError
 PIXELS_PER_BYTE = 8 * 1032
 """Of a black-and-white PNG of one colour: deflate packs 1032 bytes into one at most; JPEG stays far below."""
 
+EXR_PIXELS_PER_BYTE = 1032
+"""Of an OpenEXR picture of one colour in two bytes or more."""
+
 
 def read(path: str | Path | bytes) -> Float[Tensor, "H W 3"]:
     """Return a colour picture as linear RGB; PNG and JPEG are taken as sRGB, EXR and Radiance (.hdr) as linear.
@@ -162,6 +165,10 @@ def _read_exr(path: Path) -> Tensor:
     if not path.is_file():
         raise FormatError(f"{path}: expected a picture, found none; check the path")
     try:
+        window = OpenEXR.File(str(path), header_only=True).header()["dataWindow"]
+        width, height = (int(last) - int(first) + 1 for first, last in zip(*window, strict=True))
+        if not 0 < width * height <= EXR_PIXELS_PER_BYTE * path.stat().st_size:
+            raise ValueError(f"announces {width} x {height} pixels in {path.stat().st_size} bytes")
         channels = OpenEXR.File(str(path)).channels()
     except Exception as error:  # the binding raises RuntimeError and others
         raise FormatError(f"{path}: expected an OpenEXR picture ({error}); the copy may be incomplete") from error

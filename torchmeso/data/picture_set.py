@@ -95,6 +95,28 @@ class PictureSet:
         return f"{self.n_missing} of {len(self.lights) * len(self.views)} ({', '.join(named)}{more})"
 
 
+def by_place(
+    path: str, angles: Mapping[str, tuple[gaps.Angles, gaps.Angles]], lights: DirectionSet, views: DirectionSet
+) -> dict[Pair, str]:
+    """Return the file of each pair, from the angles (light, view) that each file has.
+
+    Raises:
+        FormatError: a direction is none of the set, or two files show the same pair.
+    """
+    files: dict[Pair, str] = {}
+    names = sorted(angles)
+    light_places = gaps.locate(lights, [angles[name][0] for name in names])
+    view_places = gaps.locate(views, [angles[name][1] for name in names])
+    for name, light, view in zip(names, light_places, view_places, strict=True):
+        if light is None or view is None:
+            what, directions = ("light", lights) if light is None else ("view", views)
+            raise FormatError(f"{path}: the {what} of '{name}' is none of {directions.name}")
+        if (light, view) in files:
+            raise FormatError(f"{path}: two pictures show the same directions: '{files[light, view]}' and '{name}'")
+        files[light, view] = name
+    return files
+
+
 def size(pictures: PictureSet) -> tuple[int, int]:
     """Return height and width of the pictures; only the first one is read.
 

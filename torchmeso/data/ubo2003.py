@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 
 from torchmeso.data import image, rgbe, store
-from torchmeso.data.picture_set import Pair, PictureSet, Reader
+from torchmeso.data.picture_set import PictureSet, Reader, by_place
 from torchmeso.errors import FormatError
 from torchmeso.geometry import gaps
 from torchmeso.geometry.hemisphere import DirectionSet
@@ -62,7 +62,7 @@ def survey(path: str | Path, *, lights: DirectionSet | None = None, views: Direc
         name=str(path),
         lights=lights,
         views=views,
-        files=_by_place(path, angles, lights, views),
+        files=by_place(str(path), angles, lights, views),
         encoding="linear" if kinds == {True} else "srgb",
         key=store.content_hash(str(path.resolve()), sorted((name, sizes[name]) for name in angles)),
         opened=_opener(path),
@@ -78,24 +78,7 @@ def _angles(name: str) -> tuple[gaps.Angles, gaps.Angles] | None:
     if suffix.lower() not in CODES + FLOATS or any(len(numbers) != 1 for numbers in found):
         return None
     tl, pl, tv, pv = (float(numbers[0]) for numbers in found)
-    return (tl, pl % 360 if tl else 0.0), (tv, pv % 360 if tv else 0.0)
-
-
-def _by_place(
-    path: Path, angles: dict[str, tuple[gaps.Angles, gaps.Angles]], lights: DirectionSet, views: DirectionSet
-) -> dict[Pair, str]:
-    files: dict[Pair, str] = {}
-    names = sorted(angles)
-    light_places = gaps.locate(lights, [angles[name][0] for name in names])
-    view_places = gaps.locate(views, [angles[name][1] for name in names])
-    for name, light, view in zip(names, light_places, view_places, strict=True):
-        if light is None or view is None:
-            what, directions = ("light", lights) if light is None else ("view", views)
-            raise FormatError(f"{path}: the {what} of '{name}' is none of {directions.name}")
-        if (light, view) in files:
-            raise FormatError(f"{path}: two pictures show the same directions: '{files[light, view]}' and '{name}'")
-        files[light, view] = name
-    return files
+    return gaps.turned((tl, pl)), gaps.turned((tv, pv))
 
 
 def _in_folder(path: Path) -> dict[str, list[int]]:

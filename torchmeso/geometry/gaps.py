@@ -11,6 +11,7 @@ Test: tests/geometry/test_gaps.py
 
 import math
 from collections.abc import Collection, Sequence
+from itertools import accumulate, chain
 
 import torch
 from jaxtyping import Bool, Float
@@ -48,6 +49,8 @@ def meant(angles: Collection[Angles], name: str) -> DirectionSet:
         FormatError: a ring has no even steps.
         ConfigError: an angle is out of range.
     """
+    if not all(map(math.isfinite, chain(*angles))):
+        raise FormatError(f"{name}: expected angles in degrees, got one that is no number")
     if len(angles) == 1:
         ((theta, phi),) = angles
         return hemisphere.from_rings((theta,), (1,), (phi,))
@@ -77,17 +80,22 @@ def _ring(phis: Sequence[float], theta: float, name: str) -> tuple[int, float]:
 
 def locate(directions: DirectionSet, angles: Collection[Angles]) -> list[int | None]:
     """Return the index of each of `angles` (degrees) in the set, None where it has none there."""
+    firsts = [0, *accumulate(directions.count)]
     places: list[int | None] = []
     for theta, phi in angles:
-        first, place = 0, None
-        for ring, count, phi0 in zip(directions.theta_deg, directions.count, directions.phi0_deg, strict=True):
-            j = round((phi - phi0) * count / 360)
-            off = abs(phi - phi0 - 360 * j / count) if ring > 0 else 0.0
-            if abs(theta - ring) <= TOLERANCE_DEG and off <= TOLERANCE_DEG:
-                place = first + j % count
-            first += count
-        places.append(place)
+        k = min(range(len(directions.count)), key=lambda ring: abs(theta - directions.theta_deg[ring]))
+        ring, count, phi0 = directions.theta_deg[k], directions.count[k], directions.phi0_deg[k]
+        j = round((phi - phi0) * count / 360)
+        off = abs(phi - phi0 - 360 * j / count) if ring > 0 else 0.0
+        there = abs(theta - ring) <= TOLERANCE_DEG and off <= TOLERANCE_DEG
+        places.append(firsts[k] + j % count if there else None)
     return places
+
+
+def turned(angles: Angles) -> Angles:
+    """Return the same direction with phi in [0, 360), and 0 at the pole."""
+    theta, phi = angles
+    return theta, phi % 360 if theta else 0.0
 
 
 def angles_deg(directions: DirectionSet) -> list[Angles]:

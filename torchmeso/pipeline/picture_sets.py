@@ -5,7 +5,7 @@ Test: tests/pipeline/test_picture_sets.py
 
 from pathlib import Path
 
-from torchmeso.data import picture_set, store, ubo2003
+from torchmeso.data import exr_stack, picture_set, store, ubo2003
 from torchmeso.data.picture_set import PictureSet
 from torchmeso.pipeline.bake import Report, silent
 
@@ -22,6 +22,8 @@ def survey(path: str | Path) -> PictureSet:
     Raises:
         FormatError: it holds none that are a BTF's.
     """
+    if (Path(path) / exr_stack.TABLE).is_file():
+        return exr_stack.survey(path)
     return ubo2003.survey(path)
 
 
