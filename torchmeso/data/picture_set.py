@@ -218,28 +218,28 @@ def _blocks(
     views = list(views)
     n_light, _, height, width, _ = shape
     names = [pictures.files[l, v] for v in views for l in range(n_light) if (l, v) in pictures.files]
-    decoded = _ahead(lambda name: _read_sized(pictures, reader, name, (height, width)), names)
+    decoded = _ahead(reader, names)
     for v in views:
         present = torch.tensor([(l, v) in pictures.files for l in range(n_light)])
         block = torch.zeros(
             n_light, height, width, 3, dtype=torch.uint8 if pictures.encoding == "srgb" else torch.float32
         )
         for l in present.nonzero()[:, 0].tolist():
-            block[l] = next(decoded)
+            picture = next(decoded)
+            _check_size(pictures, pictures.files[l, v], picture, (height, width))
+            block[l] = picture
         if bool(present.any()) and not bool(present.all()):
             _fill_lights(pictures, block, present)
         yield v, block
 
 
-def _read_sized(pictures: PictureSet, reader: Reader, name: str, size: tuple[int, int]) -> Tensor:
-    picture = reader(name)
+def _check_size(pictures: PictureSet, name: str, picture: Tensor, size: tuple[int, int]) -> None:
     if tuple(picture.shape[:2]) != size:
         height, width = picture.shape[:2]
         raise FormatError(
             f"{pictures.name}: expected pictures of {size[1]} x {size[0]} as the first one, "
             f"got {width} x {height}: {name}"
         )
-    return picture
 
 
 def _ahead(read: Callable[[str], Tensor], names: list[str]) -> Iterator[Tensor]:

@@ -3,13 +3,14 @@
 Test: tests/pipeline/test_describe.py
 """
 
+import math
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from torchmeso import config
-from torchmeso.data import btf, image, mdf, picture_set, store
+from torchmeso.data import btf, hsh, image, mdf, picture_set, ptm, rti, store
 from torchmeso.errors import FormatError, human_size
 from torchmeso.geometry import mesh, mesh_file, unwrap
 from torchmeso.geometry.mesh_file import Group
@@ -34,6 +35,8 @@ def file(path: str | Path) -> dict[str, Any]:
         return _picture_set(path)
     if name.endswith(".meso"):
         return _model(path)
+    if name.endswith((".lp", ".ptm", ".rti")):
+        return _rti(path)
     if name.endswith((".yaml", ".yml")):
         return _config(path)
     if name.endswith((".png", ".jpg", ".jpeg", ".exr", ".hdr")):
@@ -43,7 +46,7 @@ def file(path: str | Path) -> dict[str, Any]:
         return _mesh(path)
     raise FormatError(
         f"{path}: expected a table (.btf.zarr, .mdf.zarr), a model (.meso), a configuration (.yaml), "
-        "a folder or zip of the pictures of a BTF, a picture or a mesh"
+        "a folder or zip of the pictures of a BTF, an RTI file (.lp, .ptm, .rti), a picture or a mesh"
     )
 
 
@@ -75,6 +78,22 @@ def _picture_set(path: Path) -> dict[str, Any]:
         "missing": found.missing_text(),
         "on disk": _size(path),
     }
+
+
+def _rti(path: Path) -> dict[str, Any]:
+    if path.suffix.lower() == ".lp":
+        lights = rti.read(path)
+        height, width, _ = next(lights.pictures()).shape
+        last = math.degrees(math.acos(float(lights.directions[:, 2].clamp(-1, 1).min())))
+        about = {"kind": "RTI picture set", "lights": len(lights.files), "lowest light": f"{last:.0f} deg from above"}
+    elif path.suffix.lower() == ".ptm":
+        found = ptm.read(path)
+        height, width, planes, _ = found.codes.shape
+        about = {"kind": "polynomial texture map", "format": "LRGB" if planes == 1 else "RGB"}
+    else:
+        height, width, _, terms = hsh.read(path).codes.shape
+        about = {"kind": "hemispherical harmonics map", "terms": terms}
+    return {**about, "texels": f"{width} x {height}", "on disk": _size(path)}
 
 
 def _mdf(path: Path) -> dict[str, Any]:
