@@ -91,7 +91,7 @@ def test_damaged_tables_are_named(tmp_path, rng):
             exr_stack.survey(tmp_path)
     (tmp_path / "a.exr").touch()
     path.write_text(header + "a.exr,nan,0,0,0\n")
-    with pytest.raises(FormatError, match="expected angles"):
+    with pytest.raises(FormatError, match=r"expected polar angles .* got theta nan, phi 0"):
         exr_stack.survey(tmp_path)
 
 

@@ -122,10 +122,11 @@ def test_damage_is_named(tmp_path, rng):
 
 
 @pytest.mark.errors
-def test_nothing_but_our_errors_leaves(tmp_path, rng):
+@pytest.mark.parametrize("n", [1000, pytest.param(20_000, marks=pytest.mark.slow)])
+def test_nothing_but_our_errors_leaves(n, tmp_path, rng):
     whole = file_bytes(*some(4, rng))
     random = np.random.default_rng(0)
-    for k in range(1000):
+    for k in range(n):
         data = bytearray(whole[: random.integers(len(whole))] if k % 3 == 0 else whole)
         for place in random.integers(0, min(max(len(data), 1), 60), 2):
             if len(data) > place:

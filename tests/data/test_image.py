@@ -1,3 +1,4 @@
+import io
 import zlib
 
 import numpy as np
@@ -89,3 +90,23 @@ def test_codes_of_a_damaged_picture_are_refused():
 
 def png_chunk(kind, content):
     return len(content).to_bytes(4, "big") + kind + content + zlib.crc32(kind + content).to_bytes(4, "big")
+
+
+@pytest.mark.errors
+@pytest.mark.parametrize("n", [300, pytest.param(20_000, marks=pytest.mark.slow)])
+def test_nothing_but_our_errors_leaves_damaged_codes(n):
+    codes = np.random.default_rng(0).integers(0, 256, (9, 17, 3)).astype(np.uint8)
+    files = []
+    for kind in ("PNG", "JPEG"):
+        Image.fromarray(codes).save(file := io.BytesIO(), format=kind)
+        files.append(file.getvalue())
+    random = np.random.default_rng(1)
+    for k in range(n):
+        whole = files[k % 2]
+        data = bytearray(whole[: random.integers(1, len(whole))] if k % 3 == 0 else whole)
+        for place in random.integers(0, len(data), 3):
+            data[place] = random.integers(256)
+        try:
+            image.read_codes(bytes(data), "a")
+        except FormatError:
+            continue

@@ -110,10 +110,11 @@ def test_damage_is_named(tmp_path):
 
 
 @pytest.mark.errors
-def test_nothing_but_our_errors_leaves():
+@pytest.mark.parametrize("n", [1000, pytest.param(20_000, marks=pytest.mark.slow)])
+def test_nothing_but_our_errors_leaves(n):
     whole = header("-Y 6 +X 9") + packed(some_codes(), runs=True)
     random = np.random.default_rng(3)
-    for k in range(1000):
+    for k in range(n):
         data = bytearray(whole[: random.integers(len(whole))] if k % 2 else whole)
         for place in random.integers(0, max(len(data), 1), 3):
             if len(data):

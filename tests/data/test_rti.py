@@ -79,11 +79,12 @@ def test_missing_and_uneven_sets_are_refused(tmp_path):
 
 
 @pytest.mark.errors
-def test_nothing_but_our_errors_leaves(tmp_path):
+@pytest.mark.parametrize("n", [500, pytest.param(20_000, marks=pytest.mark.slow)])
+def test_nothing_but_our_errors_leaves(n, tmp_path):
     picture(tmp_path / "a.png")
     whole = b"3\na.png 0 0 1\na.png 0.1 0 1\na.png 0 -0.5 1\n"
     random = np.random.default_rng(0)
-    for _ in range(500):
+    for _ in range(n):
         data = bytearray(whole)
         for place in random.integers(0, len(data), 2):
             data[place] = random.integers(256)

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from tests.tolerances import FLOAT64
-from torchmeso.errors import ConfigError, FormatError
+from torchmeso.errors import FormatError
 from torchmeso.geometry import gaps, hemisphere
 
 
@@ -67,5 +67,5 @@ def test_what_is_no_ring_is_refused():
         gaps.meant([(20, 0), (20, 50), (20, 120), (20, 190)], "x")
     with pytest.raises(FormatError, match="x: expected at most 4096 directions on rings"):
         gaps.meant([(20, 0), (20, 0.01)], "x")
-    with pytest.raises(ConfigError, match=r"theta: expected a value from 0 to 89\.9, got 90"):
+    with pytest.raises(FormatError, match=r"x: expected polar angles from 0 to 89\.9 .* got theta 90, phi 10"):
         gaps.meant([(20, 0), (90, 10)], "x")

@@ -63,9 +63,10 @@ def decode(data: bytes, name: str) -> Float32[np.ndarray, "H W 3"]:
     with store.reading(name):
         header = read_header(data, name)
         codes = _upright(_scan_lines(data, header, name), header.order)
-    exponent = codes[..., 3:].astype(np.int32)
-    scale = np.where(exponent == 0, 0.0, np.ldexp(1.0, exponent - 136)) / header.exposure
-    return ((codes[..., :3] + 0.5) * scale).astype(np.float32)
+    step = np.ldexp(1.0, np.arange(256) - 136) / header.exposure
+    step[0] = 0
+    # A byte's middle times a power of two is exact in float32; only an exposure makes it round.
+    return (codes[..., :3] + np.float32(0.5)) * step.astype(np.float32)[codes[..., 3:]]
 
 
 def read_header(data: bytes, name: str) -> Header:

@@ -11,7 +11,7 @@ Test: tests/geometry/test_gaps.py
 
 import math
 from collections.abc import Collection, Sequence
-from itertools import accumulate, chain
+from itertools import accumulate
 
 import torch
 from jaxtyping import Bool, Float
@@ -46,11 +46,14 @@ def meant(angles: Collection[Angles], name: str) -> DirectionSet:
         name: of the set, for errors.
 
     Raises:
-        FormatError: a ring has no even steps.
-        ConfigError: an angle is out of range.
+        FormatError: a ring has no even steps, or an angle is out of range.
     """
-    if not all(map(math.isfinite, chain(*angles))):
-        raise FormatError(f"{name}: expected angles in degrees, got one that is no number")
+    wrong = [pair for pair in angles if not (0 <= pair[0] <= 89.9 and math.isfinite(pair[1]))]
+    if wrong:
+        raise FormatError(
+            f"{name}: expected polar angles from 0 to 89.9 degrees and azimuths that are numbers, "
+            f"got theta {wrong[0][0]:g}, phi {wrong[0][1]:g}"
+        )
     if len(angles) == 1:
         ((theta, phi),) = angles
         return hemisphere.from_rings((theta,), (1,), (phi,))
