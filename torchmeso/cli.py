@@ -153,7 +153,7 @@ def compress(
 ) -> None:
     """Compress a BTF TABLE (.btf.zarr, or a folder or zip of pictures) into a run-time model."""
     from torchmeso.compress import eigen
-    from torchmeso.data import btf, eigen_btf, mdf
+    from torchmeso.data import eigen_btf, mdf
     from torchmeso.pipeline import picture_sets
 
     if not out.endswith(".meso"):
@@ -162,9 +162,8 @@ def compress(
     depth = None if silhouette is None else mdf.load(silhouette)
     options = eigen.EigenOptions(rank=rank, storage=storage)
     with _progress() as report:
-        if picture_sets.is_one(table):
-            table = str(picture_sets.as_table(table, report, allow_missing=allow_missing))
-        model = eigen.fit(btf.load(table), options, progress=lambda x: report(f"{method} BTF", x))
+        source = picture_sets.open_btf(table, report, allow_missing=allow_missing)
+        model = eigen.fit(source, options, progress=lambda x: report(f"{method} BTF", x))
     eigen_btf.save(model, out, silhouette=depth)
     click.echo(out)
 
