@@ -156,14 +156,23 @@ def _bake_one(meso: str, out: Any, force: bool, options: dict[str, Any]) -> None
     "--storage", default="uint8", show_default=True, type=click.Choice(["uint8", "float16", "float32"]), help="Of maps."
 )
 @click.option("--mdf", "silhouette", help="MDF table (.mdf.zarr) to pack into the model.")
+@click.option("--allow-missing", is_flag=True, help="Interpolate pictures that a folder or zip lacks.")
 @click.option("--out", required=True, help="The run-time model (.meso).")
 @click.option("--force", is_flag=True, help="Replace an existing model.")
 def compress(
-    table: str, method: str, unbounded: bool, silhouette: str | None, out: str, force: bool, **options: Any
+    table: str,
+    method: str,
+    unbounded: bool,
+    silhouette: str | None,
+    allow_missing: bool,
+    out: str,
+    force: bool,
+    **options: Any,
 ) -> None:
-    """Compress a BTF TABLE (.btf.zarr) into a run-time model."""
+    """Compress a BTF TABLE (.btf.zarr, or a folder or zip of pictures) into a run-time model."""
     from torchmeso.compress import double_sh, eigen
-    from torchmeso.data import btf, eigen_btf, mdf, sh_btf
+    from torchmeso.data import eigen_btf, mdf, sh_btf
+    from torchmeso.pipeline import picture_sets
 
     if not out.endswith(".meso"):
         raise ConfigError(f"{out}: expected a name that ends in .meso")
@@ -176,14 +185,14 @@ def compress(
         raise ConfigError(f"compress: --method {method} has no --{(wrong or ['unbounded'])[0].replace('_', '-')}")
     if unbounded:
         given["energy"] = None
-    source = btf.load(table)
+    chosen = kind(**given)
     with _progress() as report:
+        source = picture_sets.open_btf(table, report, allow_missing=allow_missing)
         told = partial(report, f"{method} BTF")
-        if method == "eigen":
-            eigen_btf.save(eigen.fit(source, kind(**given), progress=told), out, silhouette=depth)
+        if isinstance(chosen, eigen.EigenOptions):
+            eigen_btf.save(eigen.fit(source, chosen, progress=told), out, silhouette=depth)
         else:
-            model = double_sh.fit(source, kind(**given), backend="auto", progress=told)
-            sh_btf.save(model, out, silhouette=depth)
+            sh_btf.save(double_sh.fit(source, chosen, backend="auto", progress=told), out, silhouette=depth)
     click.echo(out)
 
 
@@ -268,12 +277,18 @@ def _render_frames(settings: Any, out: str, truth: bool, force: bool, options: d
 
 @main.command()
 @click.argument("file")
-@click.option("--to", "out", required=True, help="The file to write: .glb (glTF 2.0).")
+@click.option("--to", "out", required=True, help="The file to write: .glb (glTF 2.0); of a BTF a folder of EXR.")
 @click.option("--force", is_flag=True, help="Replace an existing file.")
 def export(file: str, out: str, force: bool) -> None:
-    """Write the mesh FILE, or all objects of a configuration where they stand, with tangents for other renderers."""
+    """Write FILE for other renderers: a mesh or all objects of a configuration, a BTF table as pictures."""
     from torchmeso.pipeline import export as job
 
+    if file.rstrip("/").endswith(".btf.zarr"):
+        _refuse_to_replace(out, force)
+        with _progress() as report:
+            job.to_exr_stack(file, out, report)
+        click.echo(out)
+        return
     if not out.lower().endswith(".glb"):
         raise ConfigError(f"{out}: expected a name that ends in .glb")
     _refuse_to_replace(out, force)

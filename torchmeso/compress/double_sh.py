@@ -261,4 +261,5 @@ def _in_half(c: Float[Tensor, "k column"], where: str) -> Float[Tensor, "k colum
 def quantised(found: Float[Tensor, "k H W 3"], storage: Storage) -> tuple[Tensor, Tensor, Tensor]:
     """Return codes, scale and offset of every coefficient and channel."""
     parts = [quantize(c.float()[..., None, :], storage) for c in found]
-    return tuple(torch.stack([getattr(p, name).squeeze(-2) for p in parts]) for name in ("codes", "scale", "offset"))
+    codes, scale, offset = (torch.stack(x).squeeze(-2) for x in zip(*parts, strict=True))
+    return codes, scale, offset

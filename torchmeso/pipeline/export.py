@@ -1,4 +1,4 @@
-"""Meshes for other renderers: a mesh file, or the objects of a configuration where they stand, as GLB with tangents.
+"""Files for other programs: meshes and configurations as GLB with tangents, BTFs as a stack of EXR pictures.
 
 Test: tests/pipeline/test_export.py
 """
@@ -6,11 +6,13 @@ Test: tests/pipeline/test_export.py
 from pathlib import Path
 
 from torchmeso import config
+from torchmeso.data import btf, exr_stack
 from torchmeso.data.store import replacing
 from torchmeso.geometry import glb, mesh, mesh_file
 from torchmeso.geometry.glb import Body
 from torchmeso.geometry.mesh_file import Finish, Group
 from torchmeso.pipeline import scene
+from torchmeso.pipeline.bake import Report, silent
 
 
 def to_glb(path: str | Path, out: str | Path) -> None:
@@ -30,6 +32,16 @@ def to_glb(path: str | Path, out: str | Path) -> None:
         bodies = [Body(path.stem, dressed, part, found.groups)]
     with replacing(out) as beside:
         beside.write_bytes(glb.encode(bodies))
+
+
+def to_exr_stack(path: str | Path, out: str | Path, report: Report = silent) -> None:
+    """Write the BTF of a raw table (.btf.zarr) as the folder `out`: EXR pictures and their directions.
+
+    Raises:
+        FormatError: the table is missing or damaged.
+        StorageError: the disk is full, or the place cannot be written to.
+    """
+    exr_stack.write(btf.load(path), out, progress=lambda x: report("pictures", x))
 
 
 def _of_configuration(settings: config.Config) -> list[Body]:
