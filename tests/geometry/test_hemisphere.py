@@ -9,7 +9,15 @@ from torchmeso.errors import ConfigError
 from torchmeso.geometry import hemisphere
 from torchmeso.geometry.directions import from_angles, normalize
 
-SETS = ["grid(12, 5, 80)", "grid(15, 10, 87.5)", "ubo81", "ubo151", "grid(1, 1, 40)", "grid(3, 2, 60)"]
+SETS = [
+    "grid(12, 5, 80)",
+    "grid(15, 10, 87.5)",
+    "ubo81",
+    "ubo151",
+    "grid(1, 1, 40)",
+    "grid(3, 2, 60)",
+    "rings(0: 1, 20.5: 6, 60: 12 @ 7.5)",
+]
 
 
 @pytest.fixture(params=SETS)
@@ -134,6 +142,9 @@ def test_integer_tables_get_a_rounded_pole():
         ("grid(12)", "expected 'grid"),
         ("ubo82", "expected 'grid"),
         ("grid(12, 5, 95)", "theta: expected a value from 0 to 89.9"),
+        ("rings(0: 1, 20)", r"expected 'rings\(theta: count @ phi, ...\)' in degrees, got 'rings\(0: 1, 20\)'"),
+        ("rings(0: 1", "expected 'rings"),
+        ("rings(20: 1, 0: 1)", "increasing theta"),
         ("grid(0, 5, 80)", "n_phi: expected a value from 1"),
     ],
 )

@@ -13,6 +13,7 @@ Kernel: none (decoders in kernels_cl/data)          Test: tests/geometry/test_he
 
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import accumulate, pairwise
@@ -122,8 +123,22 @@ def ubo151() -> DirectionSet:
     )
 
 
+def from_rings(theta_deg: Sequence[float], count: Sequence[int], phi0_deg: Sequence[float]) -> DirectionSet:
+    """Return the set of these rings under a name that `parse` reads: "rings(0: 1, 15: 6, 30: 12 @ 7.5)".
+
+    A ring is written theta: count @ first azimuth, in degrees; the azimuth is left out where it is 0.
+    """
+    parts = [
+        f"{theta:.10g}: {n}" + (f" @ {phi0:.10g}" if phi0 else "")
+        for theta, n, phi0 in zip(theta_deg, count, phi0_deg, strict=True)
+    ]
+    return DirectionSet(
+        name=f"rings({', '.join(parts)})", theta_deg=tuple(theta_deg), count=tuple(count), phi0_deg=tuple(phi0_deg)
+    )
+
+
 def parse(text: str) -> DirectionSet:
-    """Return the set that `text` names: "grid(n_phi, n_theta, last_deg)", "ubo81" or "ubo151".
+    """Return the set that `text` names: "grid(n_phi, n_theta, last_deg)", "rings(...)", "ubo81" or "ubo151".
 
     Raises:
         ConfigError: the text is none of these.
@@ -131,10 +146,24 @@ def parse(text: str) -> DirectionSet:
     named = {"ubo81": ubo81, "ubo151": ubo151}
     if text.strip() in named:
         return named[text.strip()]()
+    if text.strip().startswith("rings("):
+        return _parse_rings(text.strip())
     found = re.fullmatch(r"\s*grid\(\s*(\d+)\s*,\s*(\d+)\s*,\s*([\d.]+)\s*\)\s*", text)
     if not found:
         raise ConfigError(f"directions: expected 'grid(n_phi, n_theta, last_deg)', 'ubo81' or 'ubo151', got '{text}'")
     return grid(int(found[1]), int(found[2]), float(found[3]))
+
+
+def _parse_rings(text: str) -> DirectionSet:
+    number = r"\d{1,6}(?:\.\d{1,15})?"
+    found = [
+        re.fullmatch(rf"\s*({number})\s*:\s*(\d{{1,4}})\s*(?:@\s*({number})\s*)?", part)
+        for part in text.removeprefix("rings(").removesuffix(")").split(",")
+    ]
+    rings = [(float(m[1]), int(m[2]), float(m[3] or 0)) for m in found if m]
+    if len(rings) < len(found) or not text.endswith(")"):
+        raise ConfigError(f"directions: expected 'rings(theta: count @ phi, ...)' in degrees, got '{text}'")
+    return from_rings(*zip(*rings, strict=True))
 
 
 def with_pole(table: Tensor, directions: DirectionSet, *, dim: int = 0) -> Tensor:
