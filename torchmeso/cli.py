@@ -141,9 +141,9 @@ def _bake_one(meso: str, out: Any, force: bool, options: dict[str, Any]) -> None
 @click.option("--out", required=True, help="The run-time model (.meso).")
 @click.option("--force", is_flag=True, help="Replace an existing model.")
 def compress(table: str, method: str, rank: int, storage: Any, silhouette: str | None, out: str, force: bool) -> None:
-    """Compress a BTF TABLE (.btf.zarr) into a run-time model."""
+    """Compress a BTF TABLE (.btf.zarr or .btf) into a run-time model."""
     from torchmeso.compress import eigen
-    from torchmeso.data import btf, eigen_btf, mdf
+    from torchmeso.data import btf_file, eigen_btf, mdf
 
     if not out.endswith(".meso"):
         raise ConfigError(f"{out}: expected a name that ends in .meso")
@@ -151,7 +151,7 @@ def compress(table: str, method: str, rank: int, storage: Any, silhouette: str |
     depth = None if silhouette is None else mdf.load(silhouette)
     options = eigen.EigenOptions(rank=rank, storage=storage)
     with _progress() as report:
-        model = eigen.fit(btf.load(table), options, progress=lambda x: report(f"{method} BTF", x))
+        model = eigen.fit(btf_file.load(table), options, progress=lambda x: report(f"{method} BTF", x))
     eigen_btf.save(model, out, silhouette=depth)
     click.echo(out)
 
@@ -237,16 +237,28 @@ def _render_frames(settings: Any, out: str, truth: bool, force: bool, options: d
 
 @main.command()
 @click.argument("file")
-@click.option("--to", "out", required=True, help="The file to write: .glb (glTF 2.0).")
+@click.option("--to", "out", required=True, help="The file to write: .glb (glTF 2.0); of a BTF .btf (Bonn).")
+@click.option(
+    "--method",
+    type=click.Choice(["dfmf", "bdi"]),
+    default="dfmf",
+    show_default=True,
+    help="Of .btf: factored, or all values in half precision.",
+)
+@click.option("--rank", type=int, help="Of .btf, dfmf: components of each colour channel [64, or all there are].")
 @click.option("--force", is_flag=True, help="Replace an existing file.")
-def export(file: str, out: str, force: bool) -> None:
-    """Write the mesh FILE, or all objects of a configuration where they stand, with tangents for other renderers."""
+def export(file: str, out: str, method: Any, rank: int | None, force: bool) -> None:
+    """Write FILE for other programs: a mesh or all objects of a configuration where they stand, or a BTF."""
     from torchmeso.pipeline import export as job
 
-    if not out.lower().endswith(".glb"):
-        raise ConfigError(f"{out}: expected a name that ends in .glb")
+    if not out.lower().endswith((".glb", ".btf")):
+        raise ConfigError(f"{out}: expected a name that ends in .glb or .btf")
     _refuse_to_replace(out, force)
-    job.to_glb(file, out)
+    if out.lower().endswith(".btf"):
+        with _progress() as report:
+            job.to_bonn(file, out, method=method, rank=rank, report=report)
+    else:
+        job.to_glb(file, out)
     click.echo(out)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from torchmeso import config
-from torchmeso.data import btf, image, mdf, store
+from torchmeso.data import btf, btfdbb, image, mdf, store
 from torchmeso.errors import FormatError, human_size
 from torchmeso.geometry import mesh, mesh_file, unwrap
 from torchmeso.geometry.mesh_file import Group
@@ -29,6 +29,8 @@ def file(path: str | Path) -> dict[str, Any]:
         return _btf(path)
     if name.endswith(".mdf.zarr"):
         return _mdf(path)
+    if name.endswith(".btf"):
+        return _bonn(path)
     if name.endswith(".meso"):
         return _model(path)
     if name.endswith((".yaml", ".yml")):
@@ -39,7 +41,7 @@ def file(path: str | Path) -> dict[str, Any]:
     if name.endswith((".obj", ".ply", ".glb", ".gltf", ".off", ".stl")):
         return _mesh(path)
     raise FormatError(
-        f"{path}: expected a table (.btf.zarr, .mdf.zarr), a model (.meso), a configuration (.yaml), "
+        f"{path}: expected a table (.btf.zarr, .mdf.zarr, .btf), a model (.meso), a configuration (.yaml), "
         "a picture or a mesh"
     )
 
@@ -54,6 +56,29 @@ def _btf(path: Path) -> dict[str, Any]:
         "texels": f"{table.texels[1]} x {table.texels[0]}",
         "slab depth (tiles)": table.h,
         **_origin(store.attributes(group)),
+        "on disk": _size(path),
+    }
+
+
+def _bonn(path: Path) -> dict[str, Any]:
+    found = btfdbb.survey(path)
+    header = found.header
+    try:
+        lights, views = (f", {x.directions.name}" for x in found.directions())
+    except FormatError:  # what is wrong with them is said where they are asked for
+        lights = views = ", not all on rings of even steps"
+    told = {None: "not told (taken as held)", True: "held", False: "not held (multiplied in)"}
+    notes = {"measured with": ", ".join(filter(None, header.setup)), "pixels per mm": header.ppmm}
+    return {
+        "kind": f"Bonn BTF ({header.signature}, version {header.version})",
+        "lights": f"{len(header.lights)}{lights}",
+        "views": f"{len(header.views)}{views}",
+        "texels": f"{header.width} x {header.height}",
+        "channels": ", ".join(header.channels),
+        "colour model": f"{found.colour.model} ({found.colour.name})",
+        "cos(theta_i)": told[header.cosine],
+        **found.body.facts(),
+        **{name: value for name, value in notes.items() if value},
         "on disk": _size(path),
     }
 
