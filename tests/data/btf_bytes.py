@@ -11,6 +11,8 @@ WIDTH, HEIGHT = 5, 3
 PAIRS, TEXELS = len(LIGHTS) * len(VIEWS), WIDTH * HEIGHT
 """24 pairs and 15 texels: neither can be taken for the other."""
 
+UNCHANGED = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
+
 CODES = {2: "e", 4: "f", 8: "d"}
 
 
@@ -56,7 +58,7 @@ def factors(values, size, k=None):
     return bytes([size]) + sizes + numbers(S, size) + numbers(U, size) + numbers((S[:, None] * V).T, size)
 
 
-def dfmf(values, *, model=0, mean=(0, 0, 0), transform=np.eye(3), size=8, transposed=False, k=None, **about):
+def dfmf(values, *, model=0, mean=(0, 0, 0), transform=UNCHANGED, size=8, transposed=False, k=None, **about):
     """Return a file of (pair, texel, channel) numbers: pair = light + lights * view, texels from the bottom row up."""
     n_channel = values.shape[-1]
     about.setdefault("channels", ("a", "b", "c")[:n_channel])

@@ -38,10 +38,12 @@ class DfmfOptions:
     Attributes:
         rank: components kept of each channel, at most the pairs of light and view and the texels; none = 64 or all.
         colour: what the channels are.
+        accurate: multiply in float64: twice as slow, for factors that keep values of 1e-4 of the largest.
     """
 
     rank: int | None = None
     colour: Colour = DEFAULT_COLOUR
+    accurate: bool = False
 
 
 def fit(table: Bands, options: DfmfOptions | None = None, *, progress: Progress = lambda share: None) -> Factors:
@@ -69,7 +71,8 @@ def fit(table: Bands, options: DfmfOptions | None = None, *, progress: Progress 
         nonlocal done
         for stop in range(height, 0, -step):  # files begin at the bottom row
             start = max(stop - step, 0)
-            x = btfdbb_colour.from_rgb(options.colour, table.rows(start, stop)).flip(2)
+            rgb = table.rows(start, stop)
+            x = btfdbb_colour.from_rgb(options.colour, rgb.double() if options.accurate else rgb).flip(2)
             yield x.permute(4, 2, 3, 1, 0).reshape(3, -1, pairs)
             done += stop - start
             progress(done / (height * 2 * subspace.ROUNDS))
