@@ -221,6 +221,21 @@ def test_export_writes_a_mesh_that_comes_back(tmp_path):
 
 
 @pytest.mark.errors
+def test_a_btf_goes_out_as_bonn_file_and_comes_back(tmp_path):
+    table, grid = tmp_path / "a.btf.zarr", "grid(4, 2, 80)"
+    run("bake", "--meso", "brick", "--out", table, "--texels", 8, "--lights", grid, "--views", grid, "--samples", 1)
+    bonn, plain, model = tmp_path / "a.btf", tmp_path / "b.btf", tmp_path / "a.meso"
+    assert run("export", table, "--to", bonn, "--rank", 5).stdout == f"{bonn}\n"
+    assert "exists already" in run("export", table, "--to", bonn).stderr
+    assert "components: 5, 5, 5" in run("info", bonn).stdout
+    assert run("export", bonn, "--to", plain, "--method", "bdi").exit_code == 0
+    assert "chunks: 2, full" in run("info", plain).stdout
+    assert run("compress", bonn, "--rank", 3, "--out", model).exit_code == 0
+    assert "lights: rings(" in run("info", model).stdout
+    result = run("export", table, "--to", plain, "--method", "bdi", "--rank", 5, "--force")
+    assert (result.exit_code, result.stderr.count("leave --rank out")) == (2, 1)
+
+
 def test_export_says_what_it_writes(tmp_path):
     result = run("export", "a.obj", "--to", "a.fbx")
     assert result.exit_code == 2

@@ -169,7 +169,7 @@ def compress(
     force: bool,
     **options: Any,
 ) -> None:
-    """Compress a BTF TABLE (.btf.zarr, or a folder or zip of pictures) into a run-time model."""
+    """Compress a BTF TABLE (.btf.zarr or .btf, or a folder or zip of pictures) into a run-time model."""
     from torchmeso.compress import double_sh, eigen
     from torchmeso.data import eigen_btf, mdf, sh_btf
     from torchmeso.pipeline import picture_sets
@@ -277,22 +277,33 @@ def _render_frames(settings: Any, out: str, truth: bool, force: bool, options: d
 
 @main.command()
 @click.argument("file")
-@click.option("--to", "out", required=True, help="The file to write: .glb (glTF 2.0); of a BTF a folder of EXR.")
+@click.option(
+    "--to", "out", required=True, help="The file to write: .glb (glTF 2.0); of a BTF .btf (Bonn), or a folder of EXR."
+)
+@click.option(
+    "--method",
+    type=click.Choice(["dfmf", "bdi"]),
+    default="dfmf",
+    show_default=True,
+    help="Of .btf: factored, or all values in half precision.",
+)
+@click.option("--rank", type=int, help="Of .btf, dfmf: components of each colour channel [64, or all there are].")
 @click.option("--force", is_flag=True, help="Replace an existing file.")
-def export(file: str, out: str, force: bool) -> None:
-    """Write FILE for other renderers: a mesh or all objects of a configuration, a BTF table as pictures."""
+def export(file: str, out: str, method: Any, rank: int | None, force: bool) -> None:
+    """Write FILE for other programs: a mesh or all objects of a configuration where they stand, or a BTF."""
     from torchmeso.pipeline import export as job
 
-    if file.rstrip("/").endswith(".btf.zarr"):
-        _refuse_to_replace(out, force)
-        with _progress() as report:
-            job.to_exr_stack(file, out, report)
-        click.echo(out)
-        return
-    if not out.lower().endswith(".glb"):
-        raise ConfigError(f"{out}: expected a name that ends in .glb")
+    stack = file.rstrip("/").endswith(".btf.zarr") and not out.lower().endswith((".glb", ".btf"))
+    if not (stack or out.lower().endswith((".glb", ".btf"))):
+        raise ConfigError(f"{out}: expected a name that ends in .glb or .btf, or of a BTF table a folder")
     _refuse_to_replace(out, force)
-    job.to_glb(file, out)
+    with _progress() as report:
+        if stack:
+            job.to_exr_stack(file, out, report)
+        elif out.lower().endswith(".btf"):
+            job.to_bonn(file, out, method=method, rank=rank, report=report)
+        else:
+            job.to_glb(file, out)
     click.echo(out)
 
 

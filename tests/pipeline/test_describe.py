@@ -1,6 +1,7 @@
 import pytest
 import torch
 
+from tests.data import btf_bytes
 from tests.pipeline.small import small
 from torchmeso.compress import rti
 from torchmeso.data import hsh, image, ptm
@@ -51,6 +52,33 @@ def test_rti_files(tmp_path):
     assert describe.file(tmp_path / "a.ptm")["format"] == "LRGB"
     hsh.write(rti.fit_hsh(lights), tmp_path / "a.rti")
     assert describe.file(tmp_path / "a.rti")["terms"] == 9
+
+
+def test_bonn_files(tmp_path):
+    values = btf_bytes.random_values()
+    (tmp_path / "a.btf").write_bytes(btf_bytes.dfmf(values, size=2))
+    assert describe.file(tmp_path / "a.btf") == {
+        "kind": "Bonn BTF (!DFMF08FCR, version 4)",
+        "lights": "6, rings(20: 2 @ 10, 60: 4)",
+        "views": "4, rings(0: 1, 30: 3)",
+        "texels": "5 x 3",
+        "channels": "a, b, c",
+        "colour model": "0 (RGB)",
+        "cos(theta_i)": "held",
+        "components": "15, 15, 15",
+        "storage": "float16",
+        "measured with": "dome, camera, lamp",
+        "pixels per mm": 12.5,
+        "on disk": human_size((tmp_path / "a.btf").stat().st_size),
+    }
+    scattered = [(10.0, 0.0), (40.0, 5.0), (40.0, 20.0), (40.0, 90.0), (60.0, 0.0), (70.0, 3.0)]
+    (tmp_path / "b.btf").write_bytes(btf_bytes.bdi(values, lights=scattered, cosine=0))
+    about = describe.file(tmp_path / "b.btf")
+    assert about["lights"] == "6, not all on rings of even steps"
+    assert (about["cos(theta_i)"], about["chunks"]) == ("not held (multiplied in)", "2, full")
+    (tmp_path / "c.btf").write_bytes(btf_bytes.pvf(values, version=1))
+    about = describe.file(tmp_path / "c.btf")
+    assert (about["cos(theta_i)"], about["components"]) == ("not told (taken as held)", "6 for each view")
 
 
 @pytest.mark.errors

@@ -5,10 +5,10 @@ import yaml
 from tests.data import bonn
 from tests.pipeline.small import CONTENT
 from torchmeso.config import parse
-from torchmeso.data import btf
+from torchmeso.data import btf, btfdbb
 from torchmeso.data.btf import Btf
-from torchmeso.errors import GeometryError
-from torchmeso.geometry import mesh, mesh_file
+from torchmeso.errors import ConfigError, GeometryError
+from torchmeso.geometry import hemisphere, mesh, mesh_file
 from torchmeso.pipeline import describe, export, picture_sets, scene
 
 
@@ -41,3 +41,34 @@ def test_a_mesh_without_texture_coordinates_is_refused(tmp_path):
     with pytest.raises(GeometryError, match=r"a\.obj: expected texture coordinates, got none"):
         export.to_glb(tmp_path / "a.obj", tmp_path / "a.glb")
     assert not (tmp_path / "a.glb").exists()
+
+
+def bright_table(path, rng):
+    """A raw table with highlights of 30, one lobe wide."""
+    lights, views = hemisphere.grid(6, 3, 80), hemisphere.ubo81()
+    half = lights.directions()[:, None] + views.directions()
+    lobe = (half / half.norm(dim=-1, keepdim=True))[..., 2] ** 40
+    albedo = torch.rand(4, 5, 3, generator=rng)
+    images = (0.3 * albedo + 30 * lobe[..., None, None, None]) * lights.directions()[:, 2].reshape(-1, 1, 1, 1, 1)
+    btf.save(Btf(images=images, lights=lights, views=views), path, dtype="float32")
+    return images
+
+
+def test_a_btf_is_written_as_a_bonn_file(tmp_path, rng):
+    images = bright_table(tmp_path / "a.btf.zarr", rng)
+    told = []
+    export.to_bonn(tmp_path / "a.btf.zarr", tmp_path / "a.btf", report=lambda *x: told.append(x))
+    found = btfdbb.read(tmp_path / "a.btf")
+    assert (found.views, found.lights.count) == (hemisphere.ubo81(), (6, 6, 6))
+    assert float(found.images.max()) > 20
+    assert float((found.images - images).abs().max() / images.max()) < 4e-3  # halves of logarithms; measured 7e-4
+    assert told[-1] == ("factors", pytest.approx(1))
+    export.to_bonn(tmp_path / "a.btf.zarr", tmp_path / "b.btf", method="bdi")
+    assert torch.equal(btfdbb.read(tmp_path / "b.btf").images, images.half().float())
+
+
+@pytest.mark.errors
+def test_a_rank_is_no_dial_of_plain_chunks(tmp_path, rng):
+    bright_table(tmp_path / "a.btf.zarr", rng)
+    with pytest.raises(ConfigError, match="leave --rank out"):
+        export.to_bonn(tmp_path / "a.btf.zarr", tmp_path / "b.btf", method="bdi", rank=3)

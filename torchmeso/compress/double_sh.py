@@ -30,7 +30,7 @@ from torchmeso.algebra.secular import Factors
 from torchmeso.algebra.spherical_harmonics import basis, degree_of
 from torchmeso.backends import BackendChoice, opencl
 from torchmeso.compress.quantize import Storage, quantize
-from torchmeso.data.btf import Btf
+from torchmeso.data.btf import Bands
 from torchmeso.data.sh_btf import ShBtf
 from torchmeso.errors import ShapeError, check_range
 from torchmeso.geometry.hemisphere import DirectionSet, solid_angles
@@ -107,7 +107,7 @@ def side(what: str, directions: DirectionSet, terms: int, options: DoubleShOptio
 
 
 def fit(
-    btf: Btf,
+    btf: Bands,
     options: DoubleShOptions | None = None,
     *,
     backend: BackendChoice = "torch",
@@ -238,7 +238,7 @@ def _enqueue(
     run(opencl.queue(), size, (1, 1), table, source.buffer, target.buffer, np.int32(columns), *places, np.float32(unit))
 
 
-def _bands(btf: Btf) -> Iterator[tuple[slice, Float[Tensor, "light view column"]]]:
+def _bands(btf: Bands) -> Iterator[tuple[slice, Float[Tensor, "light view column"]]]:
     """Yield bands of texel rows, and their columns."""
     height, width = btf.texels
     row_bytes = len(btf.lights) * len(btf.views) * width * 3 * 4

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from torchmeso.algebra.gram import gram, right_basis
 from torchmeso.compress.quantize import Storage, quantize
-from torchmeso.data.btf import Btf
+from torchmeso.data.btf import Bands
 from torchmeso.data.eigen_btf import EigenBtf
 from torchmeso.errors import ConfigError
 
@@ -39,7 +39,7 @@ class EigenOptions:
     storage: Storage = "uint8"
 
 
-def fit(btf: Btf, options: EigenOptions | None = None, *, progress: Progress = lambda share: None) -> EigenBtf:
+def fit(btf: Bands, options: EigenOptions | None = None, *, progress: Progress = lambda share: None) -> EigenBtf:
     """Return the eigen BTF of `btf`: among all models of its rank the one with the least squared error.
 
     Args:
@@ -76,7 +76,7 @@ def fit(btf: Btf, options: EigenOptions | None = None, *, progress: Progress = l
     )
 
 
-def _bands(btf: Btf) -> Iterator[tuple[float, Float[Tensor, "rows view"]]]:
+def _bands(btf: Bands) -> Iterator[tuple[float, Float[Tensor, "rows view"]]]:
     """Yield (share done, (row light W rgb, view)) band by band."""
     height, width = btf.texels
     row_bytes = len(btf.lights) * len(btf.views) * width * 3 * 4

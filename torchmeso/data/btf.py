@@ -53,6 +53,29 @@ class Evaluable(Protocol):
         ...
 
 
+class Bands(Protocol):
+    """A table of T that is read in bands of texel rows: `Btf`, `btfdbb.BonnBtf`."""
+
+    @property
+    def lights(self) -> DirectionSet:
+        """Directions towards the light."""
+        ...
+
+    @property
+    def views(self) -> DirectionSet:
+        """Directions towards the viewer."""
+        ...
+
+    @property
+    def texels(self) -> tuple[int, int]:
+        """Height and width of the texture."""
+        ...
+
+    def rows(self, start: int, stop: int) -> Float[Tensor, "light view rows W 3"]:
+        """Return T of texel rows start .. stop of all pictures as float32, reading no others."""
+        ...
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Btf:
     """A table of T over light, view and texel.

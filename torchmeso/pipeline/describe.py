@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from torchmeso import config
-from torchmeso.data import btf, hsh, image, mdf, picture_set, ptm, rti, store
+from torchmeso.data import btf, btfdbb, hsh, image, mdf, picture_set, ptm, rti, store
 from torchmeso.errors import FormatError, human_size
 from torchmeso.geometry import mesh, mesh_file, unwrap
 from torchmeso.geometry.mesh_file import Group
@@ -31,6 +31,8 @@ def file(path: str | Path) -> dict[str, Any]:
         return _btf(path)
     if name.endswith(".mdf.zarr"):
         return _mdf(path)
+    if name.endswith(".btf"):
+        return _bonn(path)
     if picture_sets.is_one(path):
         return _picture_set(path)
     if name.endswith(".meso"):
@@ -45,7 +47,7 @@ def file(path: str | Path) -> dict[str, Any]:
     if name.endswith((".obj", ".ply", ".glb", ".gltf", ".off", ".stl")):
         return _mesh(path)
     raise FormatError(
-        f"{path}: expected a table (.btf.zarr, .mdf.zarr), a model (.meso), a configuration (.yaml), "
+        f"{path}: expected a table (.btf.zarr, .mdf.zarr, .btf), a model (.meso), a configuration (.yaml), "
         "a folder or zip of the pictures of a BTF, an RTI file (.lp, .ptm, .rti), a picture or a mesh"
     )
 
@@ -76,6 +78,29 @@ def _picture_set(path: Path) -> dict[str, Any]:
         "values": "sRGB codes" if found.encoding == "srgb" else "linear",
         "pictures": len(found.files),
         "missing": found.missing_text(),
+        "on disk": _size(path),
+    }
+
+
+def _bonn(path: Path) -> dict[str, Any]:
+    found = btfdbb.survey(path)
+    header = found.header
+    try:
+        lights, views = (f", {x.directions.name}" for x in found.directions())
+    except FormatError:  # what is wrong with them is said where they are asked for
+        lights = views = ", not all on rings of even steps"
+    told = {None: "not told (taken as held)", True: "held", False: "not held (multiplied in)"}
+    notes = {"measured with": ", ".join(filter(None, header.setup)), "pixels per mm": header.ppmm}
+    return {
+        "kind": f"Bonn BTF ({header.signature}, version {header.version})",
+        "lights": f"{len(header.lights)}{lights}",
+        "views": f"{len(header.views)}{views}",
+        "texels": f"{header.width} x {header.height}",
+        "channels": ", ".join(header.channels),
+        "colour model": f"{found.colour.model} ({found.colour.name})",
+        "cos(theta_i)": told[header.cosine],
+        **found.body.facts(),
+        **{name: value for name, value in notes.items() if value},
         "on disk": _size(path),
     }
 

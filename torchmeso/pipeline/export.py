@@ -1,13 +1,17 @@
-"""Files for other programs: meshes and configurations as GLB with tangents, BTFs as a stack of EXR pictures.
+"""Files for other programs: meshes and configurations as GLB with tangents, BTFs as EXR pictures or Bonn's `.btf`.
 
 Test: tests/pipeline/test_export.py
 """
 
 from pathlib import Path
+from typing import Literal
 
 from torchmeso import config
-from torchmeso.data import btf, exr_stack
+from torchmeso.compress import dfmf
+from torchmeso.compress.dfmf import DfmfOptions
+from torchmeso.data import btf, btf_file, btfdbb_write, exr_stack
 from torchmeso.data.store import replacing
+from torchmeso.errors import ConfigError
 from torchmeso.geometry import glb, mesh, mesh_file
 from torchmeso.geometry.glb import Body
 from torchmeso.geometry.mesh_file import Finish, Group
@@ -42,6 +46,38 @@ def to_exr_stack(path: str | Path, out: str | Path, report: Report = silent) -> 
         StorageError: the disk is full, or the place cannot be written to.
     """
     exr_stack.write(btf.load(path), out, progress=lambda x: report("pictures", x))
+
+
+def to_bonn(
+    path: str | Path,
+    out: str | Path,
+    *,
+    method: Literal["dfmf", "bdi"] = "dfmf",
+    rank: int | None = None,
+    report: Report = silent,
+) -> None:
+    """Write the BTF `path` as a `.btf` file: factored (dfmf), or all values as halves (bdi).
+
+    Args:
+        path: a raw table (.btf.zarr), or another `.btf`.
+        out: the file.
+        method: dfmf is what readers by others know; bdi loses nothing but the bits below half.
+        rank: of dfmf, components of each colour channel; none = 64 or all.
+        report: called with a name and the share done, 0..1.
+
+    Raises:
+        ConfigError: the rank is out of range, or given to bdi.
+        MesoError: the BTF is missing, damaged, or holds values that the format cannot.
+    """
+    table = btf_file.load(path)
+    if method == "bdi":
+        if rank is not None:
+            raise ConfigError("export: --method bdi keeps all values; leave --rank out")
+        btfdbb_write.write_bdi(out, table, progress=lambda x: report("chunks", x))
+        return
+    options = DfmfOptions(rank=rank)
+    factors = dfmf.fit(table, options, progress=lambda x: report("factors", x))
+    btfdbb_write.write_dfmf(out, btfdbb_write.header_of(table, "!DFMF08FCR"), options.colour, factors)
 
 
 def _of_configuration(settings: config.Config) -> list[Body]:

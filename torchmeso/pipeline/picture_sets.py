@@ -5,8 +5,8 @@ Test: tests/pipeline/test_picture_sets.py
 
 from pathlib import Path
 
-from torchmeso.data import btf, exr_stack, picture_set, store, ubo2003
-from torchmeso.data.btf import Btf
+from torchmeso.data import btf_file, exr_stack, picture_set, store, ubo2003
+from torchmeso.data.btf import Bands
 from torchmeso.data.picture_set import PictureSet
 from torchmeso.pipeline.bake import Report, silent
 
@@ -17,14 +17,14 @@ def is_one(path: str | Path) -> bool:
     return (path.is_dir() and path.suffix != ".zarr") or path.suffix.lower() == ".zip"
 
 
-def open_btf(path: str | Path, report: Report = silent, *, allow_missing: bool = False) -> Btf:
-    """Return the BTF of a raw table, or of a folder or zip of pictures; pictures are made into a table first.
+def open_btf(path: str | Path, report: Report = silent, *, allow_missing: bool = False) -> Bands:
+    """Return the BTF of a file, or of a folder or zip of pictures; pictures are made into a table first.
 
     Raises:
         FormatError: the file is missing or damaged, or lacks pictures (unless `allow_missing`).
         StorageError: the cache cannot be written to.
     """
-    return btf.load(as_table(path, report, allow_missing=allow_missing) if is_one(path) else path)
+    return btf_file.load(as_table(path, report, allow_missing=allow_missing) if is_one(path) else path)
 
 
 def survey(path: str | Path) -> PictureSet:
