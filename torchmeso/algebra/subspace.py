@@ -36,25 +36,32 @@ def factor(
         rank: columns of the factors, 1 to min(m, n).
 
     Returns:
-        In the dtype of the blocks; V has orthonormal columns. The random start is the same every time, so equal input gives equal bits.
+        In the dtype of the blocks; V has orthonormal columns. The random start is the same every time, so equal input
+        gives equal bits.
     """
     kept = min(2 * rank + OVERSAMPLING, m, n)
     rng = torch.Generator().manual_seed(0)
-    Q = torch.randn(batch, n, kept, generator=rng, dtype=torch.float64)
-    for _ in range(ROUNDS):
-        Q = _orthonormal(Q)
-        P = torch.cat([block @ Q.to(block.dtype) for block in blocks()], 1)
-        dtype, P = P.dtype, _orthonormal(P)
-        Z, start = torch.zeros(batch, n, kept, dtype=torch.float64), 0
-        for block in blocks():
-            stop = start + block.shape[1]
-            Z += (block.mT @ P[:, start:stop].to(dtype)).double()
-            start = stop
-        Q = Z
+    P, Z = _turn(blocks, torch.randn(batch, n, kept, generator=rng, dtype=torch.float64))
+    for _ in range(ROUNDS - 1):
+        P, Z = _turn(blocks, Z)
     V, S, R = torch.linalg.svd(Z, full_matrices=False)
     V, S, R = V[..., :rank], S[..., :rank], R[:, :rank]
     sign = torch.where(V.sum(1, keepdim=True) < 0, -1.0, 1.0).double()
-    return (P @ (R.mT * (S[:, None] * sign))).to(dtype), (V * sign).to(dtype)
+    US = P.double() @ (R.mT * (S[:, None] * sign))
+    return US.to(P.dtype), (V * sign).to(P.dtype)
+
+
+def _turn(blocks: Callable[[], Iterable[Tensor]], Z: Tensor) -> tuple[Tensor, Tensor]:
+    """Return P = orth(B orth(Z)), in the dtype of the blocks, and B^T P, float64: two passes."""
+    Q = _orthonormal(Z)
+    Y = torch.cat([block @ Q.to(block.dtype) for block in blocks()], 1)
+    P = _orthonormal(Y).to(Y.dtype)
+    Z, start = torch.zeros_like(Q), 0
+    for block in blocks():
+        stop = start + block.shape[1]
+        Z += (block.mT @ P[:, start:stop]).double()
+        start = stop
+    return P, Z
 
 
 def _orthonormal(columns: Tensor) -> Tensor:
