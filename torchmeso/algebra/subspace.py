@@ -1,10 +1,10 @@
 """Leading singular vectors of matrices that are read in blocks of rows and never held: subspace iteration.
 
-P = orth(B Q), Q = orth(B^T P), in turn; each product is one pass over the rows. B is then P (B^T P)^T. Both sides are
-made orthonormal between passes (float64), so that small singular values are not squared away in float32 products;
-those below 1e-7 of the largest need float64 blocks.
-Exact, but for rounding, where the rank reaches the short side; the error is within 1e-5 of the least one where
-singular values fall like 1/k or faster, within 5e-4 where they fall like its root.
+halko2011finding, algorithm 4.4: P = orth(B Q), Q = orth(B^T P), in turn; each product is one pass over the rows, and
+B is then P (B^T P)^T. Both sides are made orthonormal between passes (float64), so that small singular values are not
+squared away in float32 products; those below 1e-7 of the largest need float64 blocks. Exact, but for rounding, where
+the rank reaches the short side; the error is within 1e-5 of the least one where singular values fall like 1/k or
+faster, within 5e-4 where they fall like its root.
 
 Test: tests/algebra/test_subspace.py
 """
