@@ -72,6 +72,7 @@ def test_explicit_choice_is_kept(no_platform):
 def test_buffers_refuse_gradients_and_views(device):
     with pytest.raises(BackendError, match="no gradient on opencl"):
         opencl.buffer(torch.zeros(4, requires_grad=True))
+    assert opencl.aligned(torch.zeros(64)[1:]).data_ptr() % 64 == 0
     with pytest.raises(BackendError, match="contiguous tensor aligned to 64 bytes"):
         opencl.buffer(torch.zeros(64)[1:])
 

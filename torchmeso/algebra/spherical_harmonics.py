@@ -93,7 +93,7 @@ def _basis_opencl(w: Float[Tensor, "k 3"], degree: int) -> Float[Tensor, "k n"]:
     out = torch.empty(len(w), size(degree))
     if not len(w):
         return out
-    source = _aligned(w)
+    source = opencl.aligned(w)
     device, device_out = opencl.buffer(source), opencl.buffer(out)
     run = opencl.kernel("algebra/spherical_harmonics.cl", "basis")
     groups = -(-len(w) // PER_ITEM)
@@ -202,7 +202,7 @@ def _rotate_opencl(c: Tensor, rotation: Tensor, degree: int) -> Tensor:
     batch = torch.broadcast_shapes(c.shape[:-1], rotation.shape[:-2])
     each = int(rotation[..., 0, 0].numel() > 1)
     R = rotation.float().expand(*batch, 3, 3) if each else rotation.float()
-    source, turns = (_aligned(x) for x in (c.expand(*batch, -1), R))
+    source, turns = (opencl.aligned(x) for x in (c.expand(*batch, -1), R))
     out = torch.empty(*batch, c.shape[-1])
     count = batch.numel()
     if not count:
@@ -214,11 +214,6 @@ def _rotate_opencl(c: Tensor, rotation: Tensor, degree: int) -> Tensor:
     run(opencl.queue(), (-(-count // PER_ITEM),), (1,), *arguments)
     opencl.read([(device_out, out)])
     return out
-
-
-def _aligned(x: Tensor) -> Tensor:
-    """Return x as a device can share it: contiguous, on a border of 64 bytes."""
-    return x if x.is_contiguous() and x.data_ptr() % 64 == 0 else x.contiguous().clone()
 
 
 @lru_cache(maxsize=8)

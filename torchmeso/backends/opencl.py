@@ -309,6 +309,11 @@ def buffer(x: Tensor) -> "cl.Buffer":
     return cl.Buffer(queue().context, flags, hostbuf=x.numpy())
 
 
+def aligned(x: Tensor) -> Tensor:
+    """Return `x` as `buffer` takes it: itself, or a copy that is contiguous and begins on a border of 64 bytes."""
+    return x if x.is_contiguous() and x.data_ptr() % 64 == 0 else x.contiguous().clone()
+
+
 def read(pairs: "Sequence[tuple[cl.Buffer, Tensor]]") -> None:
     """Wait for the queue and make what kernels wrote into `buffer`s visible in the tensors they lie over."""
     for device, x in () if _shares_memory() else pairs:

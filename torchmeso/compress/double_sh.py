@@ -190,7 +190,7 @@ def _project_opencl(samples: Tensor, light: Side, view: Side, unit: float) -> Te
     if columns < LANES:  # the kernel takes sixteen at a time
         padded = torch.nn.functional.pad(samples, (0, LANES - columns))
         return _project_opencl(padded, light, view, unit)[:, :, :columns].contiguous()
-    samples = samples if samples.is_contiguous() and samples.data_ptr() % 64 == 0 else samples.contiguous().clone()
+    samples = opencl.aligned(samples)
     width = min(COLUMNS, columns)
     between = torch.empty(views, light.terms, width)
     out = torch.empty(light.terms, view.terms, columns)
