@@ -10,10 +10,13 @@ import torch
 import yaml
 from click.testing import CliRunner
 
+from tests.data import bonn
 from tests.pipeline.small import CONTENT
 from torchmeso.backends import opencl
 from torchmeso.cli import main
-from torchmeso.data import image, mdf
+from torchmeso.data import btf, image, mdf
+from torchmeso.data.btf import Btf
+from torchmeso.geometry import hemisphere
 from torchmeso.meso.generators import GENERATORS
 
 
@@ -61,6 +64,32 @@ def test_from_a_mesostructure_to_a_model(tmp_path):
     assert mdf.load(mdf_path).texels == (16, 16)
     assert run("compress", btf_path, "--rank", 3, "--mdf", mdf_path, "--out", model).exit_code == 0
     assert "rank: 3" in run("info", model).stdout
+    few = ("--light-terms", 4, "--view-terms", 4, "--unbounded", "--mdf", mdf_path, "--out", model, "--force")
+    assert run("compress", btf_path, "--method", "double-sh", *few).exit_code == 0
+    assert "coefficients: 4 x 4 of light and view" in run("info", model).stdout
+
+
+def test_from_pictures_to_a_model(tmp_path):
+    names = bonn.write(tmp_path / "set", bonn.codes())
+    (tmp_path / "set" / names[1, 2]).unlink()
+    assert "missing: 1 of 28 (tl040 pl000 tv050 pv140)" in run("info", tmp_path / "set").stdout
+    arguments = "compress", tmp_path / "set", "--rank", 3, "--out", tmp_path / "a.meso"
+    refused = run(*arguments)
+    assert (refused.exit_code, refused.stderr.count("\n")) == (2, 1)
+    assert "pictures are missing: 1 of 28" in refused.stderr
+    assert run(*arguments, "--allow-missing").exit_code == 0
+    assert "views: rings(0: 1, 50: 3 @ 20)" in run("info", tmp_path / "a.meso").stdout
+
+
+def test_a_table_is_exported_as_pictures(tmp_path):
+    lights = hemisphere.from_rings((0, 40), (1, 6), (0, 0))
+    table = Btf(images=torch.rand(7, 7, 3, 3, 3), lights=lights, views=lights)
+    btf.save(table, tmp_path / "a.btf.zarr")
+    arguments = "export", tmp_path / "a.btf.zarr", "--to", tmp_path / "stack"
+    assert run(*arguments).stdout.strip() == str(tmp_path / "stack")
+    assert "pictures: 49" in run("info", tmp_path / "stack").stdout
+    assert "exists already; give --force" in run(*arguments).stderr
+    assert run(*arguments, "--force").exit_code == 0
 
 
 def test_render_and_compare(small, tmp_path):
@@ -105,6 +134,9 @@ REFUSED = [
     (["bake", "--meso", "brick", "--out", "x.btf.zarr", "--lights", "grid(1)"], "expected 'grid(n_phi, n_theta"),
     (["compress", "none.btf.zarr", "--out", "x.meso"], "expected a btf table, found none; bake it first"),
     (["compress", "none.btf.zarr", "--out", "x.zip"], "expected a name that ends in .meso"),
+    (["compress", "a", "--energy", "2", "--out", "x.meso"], "--method eigen has no --energy"),
+    (["compress", "a", "--unbounded", "--out", "x.meso"], "--method eigen has no --unbounded"),
+    (["compress", "a", "--method", "double-sh", "--rank", "3", "--out", "x.meso"], "double-sh has no --rank"),
     (["render", "none.yaml", "--out", "x.png"], "expected a configuration (.yaml), found none"),
     (["render", "small.yaml", "--out", "x.gif"], "expected a name that ends in .png or .exr"),
     (["render", "small.yaml", "--out", "small.yaml.png"], "exists already; give --force"),

@@ -69,8 +69,21 @@ def test_tables_are_filled_and_the_rest_is_kept(files):
     assert run(*files).stdout == ""
 
 
-def test_missing_rows_are_an_error(files):
-    files[1].write_text("<!-- bench render: nothing.* -->\n<!-- /bench -->\n")
+def test_a_part_of_a_suite_leaves_the_other_lines(files):
+    """After `bench --only`: blocks without any of its rows stay, and so do lines of ids that it lacks."""
+    files[1].write_text("<!-- bench render: nothing.* -->\nold\n<!-- /bench -->\n")
+    assert run(*files).returncode == 0
+    assert "old" in files[1].read_text()
+    kept = "| gone | 1 x |  |  |"
+    lines = ["| what | measured | goal | peak memory |", "|---|---|---|---|", "| a | 2 x |  |  |", kept]
+    files[1].write_text("\n".join(["<!-- bench render: raster.ms; gone | gone -->", *lines, "<!-- /bench -->", ""]))
+    assert run(*files).returncode == 0
+    assert kept in files[1].read_text()
+    assert "| a | 2 x" not in files[1].read_text()
+
+
+def test_missing_rows_of_a_new_line_are_an_error(files):
+    files[1].write_text("<!-- bench render: raster.ms; nothing.* -->\n<!-- /bench -->\n")
     result = run(*files)
     assert result.returncode == 1
     assert "no row 'nothing.*'" in result.stderr

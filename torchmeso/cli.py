@@ -12,6 +12,8 @@ import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import fields
+from functools import partial
 from typing import Any
 
 import click
@@ -37,9 +39,16 @@ class _Group(click.Group):
             click.echo(f"{ctx.info_name} {ctx.invoked_subcommand}: error: {error}", err=True)
             ctx.exit(2)
         except KeyboardInterrupt:
-            logging.getLogger("asyncio").setLevel(logging.CRITICAL)  # Zarr's writes are dropped: that is no news
+            _drop_what_is_left()
             click.echo(f"{ctx.info_name} {ctx.invoked_subcommand}: stopped; run it again to go on", err=True)
             ctx.exit(130)
+
+
+def _drop_what_is_left() -> None:
+    """Keep Zarr's unfinished writes from complaining while Python ends: that they are dropped is no news."""
+    logging.getLogger("asyncio").setLevel(logging.CRITICAL)
+    warnings.simplefilter("ignore")
+    sys.unraisablehook = lambda *_: None
 
 
 def _say(message: Warning | str, *_: Any) -> None:
@@ -132,27 +141,58 @@ def _bake_one(meso: str, out: Any, force: bool, options: dict[str, Any]) -> None
 
 @main.command()
 @click.argument("table")
-@click.option("--method", default="eigen", type=click.Choice(["eigen"]), show_default=True, help="Kind of model.")
-@click.option("--rank", default=4, show_default=True, help="Components kept, at most the number of views.")
+@click.option(
+    "--method", default="eigen", type=click.Choice(["eigen", "double-sh"]), show_default=True, help="Kind of model."
+)
+@click.option("--rank", type=int, help="eigen: components kept, at most the number of views [4].")
+@click.option("--light-terms", type=int, help="double-sh: coefficients over the light: 1, 4, 9, 16, 25, 36 [25].")
+@click.option("--view-terms", type=int, help="double-sh: coefficients over the view [25].")
+@click.option(
+    "--energy", type=float, help="double-sh: bound of the coefficients' energy, of what the samples show [1]."
+)
+@click.option("--unbounded", is_flag=True, help="double-sh: plain least squares.")
+@click.option("--regularise", is_flag=True, help="double-sh: more coefficients than the directions tell apart.")
 @click.option(
     "--storage", default="uint8", show_default=True, type=click.Choice(["uint8", "float16", "float32"]), help="Of maps."
 )
 @click.option("--mdf", "silhouette", help="MDF table (.mdf.zarr) to pack into the model.")
+@click.option("--allow-missing", is_flag=True, help="Interpolate pictures that a folder or zip lacks.")
 @click.option("--out", required=True, help="The run-time model (.meso).")
 @click.option("--force", is_flag=True, help="Replace an existing model.")
-def compress(table: str, method: str, rank: int, storage: Any, silhouette: str | None, out: str, force: bool) -> None:
-    """Compress a BTF TABLE (.btf.zarr or .btf) into a run-time model."""
-    from torchmeso.compress import eigen
-    from torchmeso.data import btf_file, eigen_btf, mdf
+def compress(
+    table: str,
+    method: str,
+    unbounded: bool,
+    silhouette: str | None,
+    allow_missing: bool,
+    out: str,
+    force: bool,
+    **options: Any,
+) -> None:
+    """Compress a BTF TABLE (.btf.zarr or .btf, or a folder or zip of pictures) into a run-time model."""
+    from torchmeso.compress import double_sh, eigen
+    from torchmeso.data import eigen_btf, mdf, sh_btf
+    from torchmeso.pipeline import picture_sets
 
     if not out.endswith(".meso"):
         raise ConfigError(f"{out}: expected a name that ends in .meso")
     _refuse_to_replace(out, force)
     depth = None if silhouette is None else mdf.load(silhouette)
-    options = eigen.EigenOptions(rank=rank, storage=storage)
+    given = {name: value for name, value in options.items() if value not in (None, False)}
+    kind = eigen.EigenOptions if method == "eigen" else double_sh.DoubleShOptions
+    known = {field.name for field in fields(kind)}
+    if (wrong := sorted(set(given) - known)) or (unbounded and method == "eigen"):
+        raise ConfigError(f"compress: --method {method} has no --{(wrong or ['unbounded'])[0].replace('_', '-')}")
+    if unbounded:
+        given["energy"] = None
+    chosen = kind(**given)
     with _progress() as report:
-        model = eigen.fit(btf_file.load(table), options, progress=lambda x: report(f"{method} BTF", x))
-    eigen_btf.save(model, out, silhouette=depth)
+        source = picture_sets.open_btf(table, report, allow_missing=allow_missing)
+        told = partial(report, f"{method} BTF")
+        if isinstance(chosen, eigen.EigenOptions):
+            eigen_btf.save(eigen.fit(source, chosen, progress=told), out, silhouette=depth)
+        else:
+            sh_btf.save(double_sh.fit(source, chosen, backend="auto", progress=told), out, silhouette=depth)
     click.echo(out)
 
 
@@ -237,7 +277,9 @@ def _render_frames(settings: Any, out: str, truth: bool, force: bool, options: d
 
 @main.command()
 @click.argument("file")
-@click.option("--to", "out", required=True, help="The file to write: .glb (glTF 2.0); of a BTF .btf (Bonn).")
+@click.option(
+    "--to", "out", required=True, help="The file to write: .glb (glTF 2.0); of a BTF .btf (Bonn), or a folder of EXR."
+)
 @click.option(
     "--method",
     type=click.Choice(["dfmf", "bdi"]),
@@ -251,14 +293,17 @@ def export(file: str, out: str, method: Any, rank: int | None, force: bool) -> N
     """Write FILE for other programs: a mesh or all objects of a configuration where they stand, or a BTF."""
     from torchmeso.pipeline import export as job
 
-    if not out.lower().endswith((".glb", ".btf")):
-        raise ConfigError(f"{out}: expected a name that ends in .glb or .btf")
+    stack = file.rstrip("/").endswith(".btf.zarr") and not out.lower().endswith((".glb", ".btf"))
+    if not (stack or out.lower().endswith((".glb", ".btf"))):
+        raise ConfigError(f"{out}: expected a name that ends in .glb or .btf, or of a BTF table a folder")
     _refuse_to_replace(out, force)
-    if out.lower().endswith(".btf"):
-        with _progress() as report:
+    with _progress() as report:
+        if stack:
+            job.to_exr_stack(file, out, report)
+        elif out.lower().endswith(".btf"):
             job.to_bonn(file, out, method=method, rank=rank, report=report)
-    else:
-        job.to_glb(file, out)
+        else:
+            job.to_glb(file, out)
     click.echo(out)
 
 
@@ -286,7 +331,7 @@ def compare(a: str, b: str, out: str | None, as_json: bool) -> None:
 
 
 @main.command()
-@click.argument("suite", type=click.Choice(["render", "skip", "stability", "tables"]))
+@click.argument("suite", type=click.Choice(["compress", "render", "skip", "stability", "tables"]))
 @click.option("--quick", is_flag=True, help="Fewer repetitions and sweep points; never smaller sizes.")
 @click.option("--prepare", is_flag=True, help="Only bake what the suite needs into the cache.")
 @click.option("--only", multiple=True, help="Rows whose id begins with this; may be repeated.")
@@ -294,10 +339,11 @@ def compare(a: str, b: str, out: str | None, as_json: bool) -> None:
 @click.option("--plot", "plot_path", help="Draw the curves into this picture (.png, .svg).")
 def bench(suite: str, quick: bool, prepare: bool, only: tuple[str, ...], json_path: str | None, plot_path: Any) -> None:
     """Measure SUITE: accuracy against truth, time against peers in the same run."""
-    from torchmeso.bench import colour, frames, plot, render, skips, stability, tables
+    from torchmeso.bench import colour, compress, frames, plot, render, skips, stability, tables
     from torchmeso.bench import suite as suites
 
     measurements = {
+        "compress": compress.MEASUREMENTS,
         "render": render.MEASUREMENTS,
         "skip": skips.MEASUREMENTS,
         "stability": stability.MEASUREMENTS,

@@ -19,6 +19,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator, validate_call
 
 from torchmeso.backends import BackendChoice
+from torchmeso.compress.double_sh import DoubleShOptions
 from torchmeso.compress.eigen import EigenOptions
 from torchmeso.data import height_field
 from torchmeso.errors import ConfigError, FormatError, MesoError, did_you_mean
@@ -134,6 +135,7 @@ class MesoConfig(BaseModel):
 class MaterialConfig(_Strict):
     """A mesostructure with how to bake and compress it; or a finished model; or a plain colour with pictures.
 
+    A BTF becomes an eigen BTF, or a double-SH BTF where `double_sh` is given.
     `rank` reads only that many components of a model; the others stay on disk. `albedo` multiplies `albedo_map`.
     """
 
@@ -147,6 +149,7 @@ class MaterialConfig(_Strict):
     btf: BtfOptions = Field(default_factory=BtfOptions)
     mdf: MdfOptions = Field(default_factory=MdfOptions)
     eigen: EigenOptions = Field(default_factory=EigenOptions)
+    double_sh: DoubleShOptions | None = None
 
     @model_validator(mode="after")
     def _check(self) -> "MaterialConfig":
@@ -515,6 +518,7 @@ def _fields(kind: Any) -> dict[str, Any]:
         "btf": BtfOptions,
         "mdf": MdfOptions,
         "eigen": EigenOptions,
+        "double_sh": DoubleShOptions,
         "lights": SpotConfig,
     }
     if inspect.isclass(kind) and issubclass(kind, BaseModel):

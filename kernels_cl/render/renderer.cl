@@ -1,8 +1,10 @@
 // A frame: tiles of the camera's picture are filled, tested and shaded while they lie in the cache.
 // Host: torchmeso/render/renderer.py
 //
-// Compiled with SILHOUETTE and MIXED (see silhouette.clh), ONE_LAYER, and SHADOWS where lights have maps.
+// Compiled with SILHOUETTE and MIXED (see silhouette.clh), ONE_LAYER, SHADOWS where lights have maps, and HARMONICS where
+// there are double-SH BTFs.
 
+#include "data/sh_btf.clh"
 #include "data/textured.clh"
 #include "render/shadow_map.clh"
 
@@ -77,6 +79,12 @@ static int facing(__global const Light *light, const Vector3 *normal, const Vect
     return bits & to_bits(dot3(toward(light, position, &falloff), *normal) > 0.0f);
 }
 
+#ifdef HARMONICS
+#define DIFFUSE (!eigen && !harmonic)
+#else
+#define DIFFUSE (!eigen)
+#endif
+
 // Radiance of the points of one object in the lanes `bits`, added to `rgb`.
 static void shade_object(const Place *place, __global const Reflectance *reflectance, __global const Light *lights,
                          __global const Frame *frame, const Rays *rays, const Seen *seen, const int bits,
@@ -86,6 +94,10 @@ static void shade_object(const Place *place, __global const Reflectance *reflect
     const Vector3 towards = {-rays->direction.x, -rays->direction.y, -rays->direction.z};
     const Vector3 wo = to_local(&seen->at, towards);
     const int eigen = reflectance->there == EIGEN;
+#ifdef HARMONICS
+    const int harmonic = reflectance->there == HARMONIC;
+    Contracted contracted;
+#endif
     Footprint view;
     Area area;
     Weights first;
@@ -99,8 +111,14 @@ static void shade_object(const Place *place, __global const Reflectance *reflect
         const float16 depth = dot3(from_eye, rays->direction) / rays->stretch;
         pixel *= MAX(depth, (float16)0.0f);
     }
-    if (!eigen) {
+    if (DIFFUSE) {
         normal = diffuse_at(tables, reflectance, seen->at.u, seen->at.v, wo, filtered, pixel, bits, albedo);
+#ifdef HARMONICS
+    } else if (harmonic) {
+        look_around(TABLE(Level, tables, reflectance->levels), reflectance->level_count, seen->at.u, seen->at.v, wo,
+                    filtered, pixel, MOST_PROBES, bits, &area);
+        contract(tables, reflectance, wo, &area, bits, &contracted);
+#endif
     } else {
         view = footprint(TABLE(Ring, tables, reflectance->view_rings), reflectance->view_count, wo);
         look_around(TABLE(Level, tables, reflectance->levels), reflectance->level_count, seen->at.u, seen->at.v, wo,
@@ -119,7 +137,7 @@ static void shade_object(const Place *place, __global const Reflectance *reflect
         const int arrives = bits & ~blocked[i] & to_bits((wi.z > 0.0f) & (falloff * most > 0.0f));
         lit |= arrives;
         if (!arrives) continue;
-        if (!eigen) {
+        if (DIFFUSE) {
             const Floats part = {falloff * MAX(dot3(normal, wi), (float16)0.0f) * (1.0f / PI)};
             for (int b = arrives; b; b &= b - 1) {
                 const int l = __builtin_ctz(b);
@@ -127,12 +145,19 @@ static void shade_object(const Place *place, __global const Reflectance *reflect
             }
             continue;
         }
-        const Footprint from = footprint(TABLE(Ring, tables, reflectance->light_rings), reflectance->light_count, wi);
         float16 horizon = wi.z / reflectance->last_cosine;
         horizon = horizon > 1.0f ? 1.0f : horizon;
         const Floats arriving = {falloff * horizon * (1.0f / PI)};
-        reflect(tables, reflectance, frame->rank_error, &view, &first, &area, &from, arrives, T,
-                &tally->spared);
+#ifdef HARMONICS
+        if (harmonic) {
+            reflect_harmonics(tables, reflectance, wi, &contracted, arrives, T);
+        } else
+#endif
+        {
+            const Footprint from =
+                footprint(TABLE(Ring, tables, reflectance->light_rings), reflectance->light_count, wi);
+            reflect(tables, reflectance, frame->rank_error, &view, &first, &area, &from, arrives, T, &tally->spared);
+        }
         for (int b = arrives; b; b &= b - 1) {
             const int l = __builtin_ctz(b);
             rgb[l] += not_negative(T[l]) * power * arriving.lane[l];
@@ -141,7 +166,7 @@ static void shade_object(const Place *place, __global const Reflectance *reflect
 
     const int dark = frame->ambient_paper ? bits & ~lit : bits;
     if (frame->ambient <= 0.0f || !dark) return;
-    if (!eigen) {
+    if (DIFFUSE) {
         const Floats open = {0.5f * (1.0f + normal.z)};
         for (int b = dark; b; b &= b - 1) {
             const int l = __builtin_ctz(b);
@@ -150,10 +175,17 @@ static void shade_object(const Place *place, __global const Reflectance *reflect
         return;
     }
     // Light from everywhere shows little of what is small: one place is enough.
-    if (area.count > 1)
+    const int several = area.count > 1;
+    if (several)
         look_around(TABLE(Level, tables, reflectance->levels), reflectance->level_count, seen->at.u, seen->at.v, wo,
                     filtered, pixel, 1, bits, &area);
-    reflect_ambient(tables, reflectance, &view, &first, &area, dark, T);
+#ifdef HARMONICS
+    if (harmonic) {
+        if (several) contract(tables, reflectance, wo, &area, dark, &contracted);
+        ambient_harmonics(tables, reflectance, &contracted, dark, T);
+    } else
+#endif
+        reflect_ambient(tables, reflectance, &view, &first, &area, dark, T);
     for (int b = dark; b; b &= b - 1) rgb[__builtin_ctz(b)] += frame->ambient * not_negative(T[__builtin_ctz(b)]);
 }
 

@@ -3,8 +3,9 @@ import math
 import pytest
 import torch
 
-from tests.tolerances import FLOAT64
+from tests.tolerances import FLOAT32, FLOAT64
 from torchmeso.data import btf as btf_module
+from torchmeso.data import image
 from torchmeso.data.address import texel_centres
 from torchmeso.data.btf import Btf
 from torchmeso.errors import FormatError, ShapeError
@@ -134,4 +135,41 @@ def test_damage_on_disk_is_named(tmp_path, rng):
     meta = path / "images" / "zarr.json"
     meta.write_text('{"zarr_format": 3, "node_type": "group"}')
     with pytest.raises(FormatError, match="expected an array 'images', got a group"):
+        btf_module.load(path)
+
+
+def test_codes_are_decoded_where_they_are_read(tmp_path, rng):
+    codes = torch.randint(0, 256, (len(LIGHTS), len(VIEWS), 5, 6, 3), generator=rng, dtype=torch.uint8)
+    linear = image.to_linear(codes.double() / 255)
+    coded, floats = (
+        Btf(images=codes, lights=LIGHTS, views=VIEWS, encoding="srgb"),
+        Btf(images=linear, lights=LIGHTS, views=VIEWS),
+    )
+    torch.testing.assert_close(coded.pictures().double(), linear, **FLOAT32)
+    torch.testing.assert_close(coded.rows(1, 3).double(), linear[:, :, 1:3], **FLOAT32)
+    w = normalize(torch.rand(2, 50, 3, dtype=torch.float64, generator=rng) * 2 - torch.tensor([1.0, 1.0, 0.0]))
+    uv = torch.rand(50, 2, dtype=torch.float64, generator=rng)
+    torch.testing.assert_close(coded.evaluate(uv, *w), floats.evaluate(uv, *w), **FLOAT32)
+    torch.testing.assert_close(coded.ambient(uv, w[1]), floats.ambient(uv, w[1]), **FLOAT32)
+
+
+def test_codes_without_poles_to_add_stay_bytes(rng):
+    lights = hemisphere.from_rings((0, 50), (1, 5), (0, 0))
+    codes = torch.randint(0, 256, (6, 6, 3, 3, 3), generator=rng, dtype=torch.uint8)
+    coded = Btf(images=codes, lights=lights, views=lights, encoding="srgb")
+    w = lights.directions()[4]
+    T = coded.evaluate(texel_centres(3, 3), w.expand(3, 3, 3), w.expand(3, 3, 3))
+    torch.testing.assert_close(T, image.decode_codes(codes[4, 4]), **FLOAT32)
+    assert coded._nodes.dtype == torch.uint8
+
+
+@pytest.mark.errors
+def test_an_encoding_that_does_not_fit_is_refused(tmp_path, rng):
+    for dtype, encoding in ((torch.uint8, "linear"), (torch.float32, "srgb")):
+        images = torch.zeros(len(LIGHTS), len(VIEWS), 2, 2, 3, dtype=dtype)
+        with pytest.raises(ShapeError, match=r"expected uint8 codes \(encoding srgb\) or floats \(linear\), got torch"):
+            Btf(images=images, lights=LIGHTS, views=VIEWS, encoding=encoding)
+    path = tmp_path / "a.btf.zarr"
+    btf_module.save(random_btf(rng), path, encoding="log")
+    with pytest.raises(FormatError, match="expected the encoding 'linear' or 'srgb', got 'log'"):
         btf_module.load(path)

@@ -1,3 +1,6 @@
+import io
+import zlib
+
 import numpy as np
 import pytest
 import torch
@@ -66,3 +69,44 @@ def test_an_exr_that_cannot_be_written(tmp_path, monkeypatch):
     with pytest.raises(StorageError, match=r"a\.exr: could not be written \(File too large\.\)"):
         image.write_exr(tmp_path / "a.exr", torch.zeros(2, 2, 3))
     assert not list(tmp_path.iterdir())
+
+
+def test_codes_decode_and_encode_to_themselves(tmp_path):
+    codes = torch.arange(256, dtype=torch.uint8).reshape(16, 16, 1).repeat(1, 1, 3)
+    assert torch.equal(image.encode_codes(image.decode_codes(codes)), codes)
+    torch.testing.assert_close(image.decode_codes(codes), image.to_linear(codes.float() / 255))
+    Image.fromarray(codes.numpy()).save(tmp_path / "a.png")
+    assert torch.equal(image.read_codes((tmp_path / "a.png").read_bytes(), "a"), codes)
+
+
+@pytest.mark.errors
+def test_codes_of_a_damaged_picture_are_refused():
+    with pytest.raises(FormatError, match="a: cannot be read"):
+        image.read_codes(b"\xff\xd8\xff\xe0 not much", "a")
+    header = b"\x89PNG\r\n\x1a\n" + png_chunk(b"IHDR", (9000).to_bytes(4, "big") * 2 + b"\x08\x02\0\0\0")
+    with pytest.raises(FormatError, match="a: announces 9000 x 9000 pixels, too many for 45 bytes"):
+        image.read_codes(header + png_chunk(b"IDAT", b""), "a")
+
+
+def png_chunk(kind, content):
+    return len(content).to_bytes(4, "big") + kind + content + zlib.crc32(kind + content).to_bytes(4, "big")
+
+
+@pytest.mark.errors
+@pytest.mark.parametrize("n", [300, pytest.param(20_000, marks=pytest.mark.slow)])
+def test_nothing_but_our_errors_leaves_damaged_codes(n):
+    codes = np.random.default_rng(0).integers(0, 256, (9, 17, 3)).astype(np.uint8)
+    files = []
+    for kind in ("PNG", "JPEG"):
+        Image.fromarray(codes).save(file := io.BytesIO(), format=kind)
+        files.append(file.getvalue())
+    random = np.random.default_rng(1)
+    for k in range(n):
+        whole = files[k % 2]
+        data = bytearray(whole[: random.integers(1, len(whole))] if k % 3 == 0 else whole)
+        for place in random.integers(0, len(data), 3):
+            data[place] = random.integers(256)
+        try:
+            image.read_codes(bytes(data), "a")
+        except FormatError:
+            continue

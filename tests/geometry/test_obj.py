@@ -96,6 +96,8 @@ def test_corners_are_written_in_many_ways(corners, others, tmp_path):
         ("v 0 0 0\nv 1 0 0\n", GeometryError, r"a\.obj: expected triangles, got none"),
         ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 4\n", FormatError, r"a\.obj: expected an OBJ file"),
         ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 0 1 2\n", FormatError, "names vertex 0; the first is 1"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf -0.7 2 3\n", FormatError, r"a\.obj: expected an OBJ file"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 99999999999999999999\n", FormatError, r"a\.obj: expected an OBJ file"),
         ("v 0 0 0\nv 1 x 0\nv 0 1 0\nf 1 2 3\n", FormatError, r"a\.obj: expected an OBJ file"),
         ("v 0 0 0\nv 1 nan 0\nv 0 1 0\nf 1 2 3\n", GeometryError, "expected finite vertex positions"),
     ],

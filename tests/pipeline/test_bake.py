@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from tests.pipeline.small import small
+from torchmeso.compress.double_sh import DoubleShOptions
 from torchmeso.data import store
 from torchmeso.errors import ConfigError, FormatError
 from torchmeso.pipeline import bake
@@ -42,6 +43,16 @@ def test_another_option_is_another_entry():
     more = brick.model_copy(update={"eigen": replace(brick.eigen, rank=3)})
     assert bake.table_paths(more) == paths
     assert bake.model_path(more) != bake.model_path(brick)
+
+
+def test_double_sh_instead_of_eigen(cache):
+    few = DoubleShOptions(light_terms=4, view_terms=4)
+    brick = small().materials["brick"].model_copy(update={"double_sh": few})
+    assert bake.model_path(brick) != bake.model_path(small().materials["brick"])
+    found = bake.prepare_material("brick", brick).material
+    assert found.btf.terms == (4, 4)
+    assert found.mdf is not None
+    assert bake.open_model(bake.model_path(brick), rank=1).btf.terms == (1, 1)
 
 
 def test_content_of_files_counts(tmp_path):

@@ -3,8 +3,12 @@ import torch
 
 from tests.data import btf_bytes
 from tests.pipeline.small import small
-from torchmeso.data import image
+from torchmeso.compress import rti
+from torchmeso.data import hsh, image, ptm
+from torchmeso.data import rti as rti_files
+from torchmeso.data.rti import LightSet
 from torchmeso.errors import FormatError, human_size
+from torchmeso.geometry import hemisphere
 from torchmeso.pipeline import bake, describe
 
 
@@ -33,6 +37,21 @@ def test_other_files(tmp_path):
     assert "unwrap: true" in describe.file(tmp_path / "a.obj")["texture coordinates"]
     (tmp_path / "b.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nf 1/1 2/2 3/3\n")
     assert describe.file(tmp_path / "b.obj")["components"] == "1, 0 closed"
+
+
+def test_rti_files(tmp_path):
+    w = hemisphere.from_rings((0, 30, 60), (1, 5, 7), (0, 0, 0)).directions()
+    files = tuple(tmp_path / f"{k}.png" for k in range(len(w)))
+    for file in files:
+        image.write_png(file, torch.ones(3, 5, 3))
+    lights = LightSet(files=files, directions=w)
+    rti_files.write(lights, tmp_path / "a.lp")
+    about = describe.file(tmp_path / "a.lp")
+    assert (about["lights"], about["lowest light"], about["texels"]) == (13, "60 deg from above", "5 x 3")
+    ptm.write(rti.fit_ptm(lights), tmp_path / "a.ptm")
+    assert describe.file(tmp_path / "a.ptm")["format"] == "LRGB"
+    hsh.write(rti.fit_hsh(lights), tmp_path / "a.rti")
+    assert describe.file(tmp_path / "a.rti")["terms"] == 9
 
 
 def test_bonn_files(tmp_path):

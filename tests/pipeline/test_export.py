@@ -2,14 +2,14 @@ import pytest
 import torch
 import yaml
 
+from tests.data import bonn
 from tests.pipeline.small import CONTENT
 from torchmeso.config import parse
-from torchmeso.data import btf as btf_module
-from torchmeso.data import btfdbb
+from torchmeso.data import btf, btfdbb
 from torchmeso.data.btf import Btf
 from torchmeso.errors import ConfigError, GeometryError
 from torchmeso.geometry import hemisphere, mesh, mesh_file
-from torchmeso.pipeline import export, scene
+from torchmeso.pipeline import describe, export, picture_sets, scene
 
 
 def test_a_configuration_is_written_where_it_stands(tmp_path):
@@ -24,6 +24,15 @@ def test_a_configuration_is_written_where_it_stands(tmp_path):
     corner = torch.cat([torus.tangents[torus.faces], plane.tangents[plane.faces]])
     torch.testing.assert_close(body.tangents[body.faces], corner, rtol=0, atol=1e-6)
     assert body.closed.tolist() == [True, False]
+
+
+def test_a_table_is_written_as_pictures_that_make_a_table_again(tmp_path, monkeypatch, rng):
+    monkeypatch.setenv("TORCHMESO_CACHE", str(tmp_path / "cache"))
+    images = torch.rand(7, 4, 3, 5, 3, generator=rng)
+    btf.save(Btf(images=images, lights=bonn.LIGHTS, views=bonn.VIEWS), tmp_path / "a.btf.zarr", dtype="float32")
+    export.to_exr_stack(tmp_path / "a.btf.zarr", tmp_path / "stack")
+    assert describe.file(tmp_path / "stack")["values"] == "linear"
+    assert torch.equal(btf.load(picture_sets.as_table(tmp_path / "stack")).pictures(), images)
 
 
 @pytest.mark.errors
@@ -41,7 +50,7 @@ def bright_table(path, rng):
     lobe = (half / half.norm(dim=-1, keepdim=True))[..., 2] ** 40
     albedo = torch.rand(4, 5, 3, generator=rng)
     images = (0.3 * albedo + 30 * lobe[..., None, None, None]) * lights.directions()[:, 2].reshape(-1, 1, 1, 1, 1)
-    btf_module.save(Btf(images=images, lights=lights, views=views), path, dtype="float32")
+    btf.save(Btf(images=images, lights=lights, views=views), path, dtype="float32")
     return images
 
 

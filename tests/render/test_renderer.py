@@ -5,11 +5,13 @@ import torch
 
 from tests.render.scenes import camera, sun
 from torchmeso.backends import opencl
-from torchmeso.compress import eigen
+from torchmeso.compress import double_sh, eigen
+from torchmeso.compress.double_sh import DoubleShOptions
 from torchmeso.compress.eigen import EigenOptions
+from torchmeso.data.sh_btf import ShBtf
 from torchmeso.data.textured import Textured
 from torchmeso.errors import BackendError
-from torchmeso.geometry import mesh, shapes
+from torchmeso.geometry import hemisphere, mesh, shapes
 from torchmeso.geometry.light import PointLight, SpotLight
 from torchmeso.meso import bake_btf, bake_mdf, generators
 from torchmeso.meso.bake_btf import BtfOptions
@@ -457,6 +459,35 @@ def test_pictures_of_colours_and_normals(rule, brick, device, rng):
     assert wrong <= 4
     alike = (exact.owner == fast.owner) & (exact.shadowed == fast.shadowed).all(0)
     assert (exact.rgb - fast.rgb)[alike].abs().quantile(0.99) < 3e-4
+
+
+@pytest.mark.parametrize("storage", ["uint8", "float32"])
+@pytest.mark.parametrize("rule", ["add", "paper"])
+def test_spherical_harmonics(storage, rule, brick, device):
+    """A double-SH BTF beside an eigen BTF, near and small in the picture: the same picture as torch."""
+    table = bake_btf.in_memory(
+        generators.brick(), BtfOptions(texels=16, lights="grid(8, 4, 80)", views="grid(6, 3, 80)", samples=1, bounces=0)
+    )
+    few = DoubleShOptions(light_terms=16, view_terms=9, storage=storage)
+    smooth = Material(btf=double_sh.fit(table, few), mdf=brick.mdf)
+    objects = (
+        Object(mesh=shapes.torus(tiles=(6, 2), triangles=600), material=smooth),
+        Object(mesh=moved(shapes.plane(size=(6.0, 6.0), tiles=(9, 9)), y=-0.6), material=smooth),
+        Object(mesh=moved(shapes.sphere(radius=0.4, triangles=300), y=0.6), material=brick),
+    )
+    scene = Scene(objects=objects, lights=LIGHTS["spot"], ambient=0.3, ambient_rule=rule)
+    exact, fast, wrong = compare(scene, camera((1.5, 2.0, 3.5), size=96), FrameOptions(shadow_map_size=128))
+    assert wrong <= 4
+    alike = (exact.owner == fast.owner) & (exact.shadowed == fast.shadowed).all(0)
+    assert (exact.rgb - fast.rgb)[alike].abs().quantile(0.99) < 3e-4
+
+
+def test_harmonics_have_a_limit_on_the_device(device):
+    one, far = torch.ones(81, 1, 3), hemisphere.ubo81()
+    many = ShBtf(maps=torch.zeros(81, 1, 1, 1, 3), scale=one, offset=one, lights=far, views=far)
+    body = Object(mesh=shapes.plane(size=(1.0, 1.0), tiles=(1, 1)), material=Material(btf=many))
+    with pytest.raises(BackendError, match="expected at most 64 coefficients of light or view, got 81"):
+        Renderer(Scene(objects=(body,), lights=()))
 
 
 @pytest.mark.slow

@@ -64,9 +64,13 @@ def fit(btf: Bands, options: EigenOptions | None = None, *, progress: Progress =
     basis = right_basis(gram(bands(0, 0.5), n_view), options.rank)
     W = basis.vectors.float()
     height, width = btf.texels
-    scores = torch.cat([band @ W for band in bands(0.5, 1)])
-    maps = scores.reshape(height, len(btf.lights), width, 3, options.rank).permute(1, 0, 2, 4, 3)
-    codes = quantize(maps.contiguous(), options.storage)
+    maps = torch.empty(len(btf.lights), height, width, options.rank, 3)
+    row = 0
+    for band in bands(0.5, 1):
+        scores = (band @ W).unflatten(0, (-1, len(btf.lights), width, 3))
+        maps[:, row : row + len(scores)] = scores.permute(1, 0, 2, 4, 3)
+        row += len(scores)
+    codes = quantize(maps, options.storage)
     return EigenBtf(
         maps=codes.codes, weights=W, scale=codes.scale, offset=codes.offset, lights=btf.lights, views=btf.views
     )

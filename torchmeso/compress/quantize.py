@@ -12,6 +12,10 @@ from torch import Tensor
 Storage = Literal["uint8", "float16", "float32"]
 
 
+PART = 1 << 16
+"""Values of each component and channel that are turned into codes at a time."""
+
+
 class Codes(NamedTuple):
     """Quantised values: value = offset + scale * code.
 
@@ -35,7 +39,10 @@ def quantize(values: Float[Tensor, "*batch rank 3"], storage: Storage) -> Codes:
     low, high = flat.amin(0), flat.amax(0)
     if storage == "uint8":
         step = ((high - low) / 255).clamp(min=torch.finfo(torch.float32).tiny)
-        return Codes(((values - low) / step).round().clamp(0, 255).to(torch.uint8), step, low)
+        codes = torch.empty(flat.shape, dtype=torch.uint8)
+        for part, place in zip(flat.split(PART), codes.split(PART), strict=True):  # copies of all would be large
+            place[...] = ((part - low) / step).round_().clamp_(0, 255)
+        return Codes(codes.reshape(values.shape), step, low)
     zero = torch.zeros_like(low)
     if storage == "float16":
         size = torch.maximum(high.abs(), low.abs()).clamp(min=torch.finfo(torch.float32).tiny)

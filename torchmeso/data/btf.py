@@ -1,7 +1,8 @@
 """The bidirectional texture function as measured or baked: one picture per light and view.
 
 Values are T = pi f_r cos(theta_i), linear RGB, unclamped. Pictures may lie in memory or on disk; `rows` reads
-a band of texels either way, so that fits can stream.
+a band of texels either way, so that fits can stream. Pictures that came as sRGB codes stay codes, a quarter of the
+floats they stand for, and are decoded where they are read.
 
 Test: tests/data/test_btf.py
 """
@@ -10,15 +11,15 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 import torch
 import zarr
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 from torch import Tensor
 
-from torchmeso.data import address, store
+from torchmeso.data import address, image, store
 from torchmeso.data.pyramid import Footprint
 from torchmeso.errors import FormatError, ShapeError, check_finite, check_shape
 from torchmeso.geometry import hemisphere
@@ -26,6 +27,9 @@ from torchmeso.geometry.hemisphere import DirectionSet
 
 LARGEST = 1e15
 """Values of T beyond it are damage, not light: their squares would not fit into the float32 sums of a fit."""
+
+
+Encoding = Literal["linear", "srgb"]
 
 
 @runtime_checkable
@@ -82,16 +86,23 @@ class Btf:
         lights: directions towards the light.
         views: directions towards the viewer.
         h: slab depth of the mesostructure in tile units; 0 where it is unknown.
+        encoding: of the images: linear values, or uint8 codes in sRGB.
     """
 
-    images: Float[Tensor, "light view H W 3"] | zarr.Array
+    images: Shaped[Tensor, "light view H W 3"] | zarr.Array
     lights: DirectionSet
     views: DirectionSet
     h: float = 0.0
+    encoding: Encoding = "linear"
 
     def __post_init__(self) -> None:
-        """Raise ShapeError unless the directions match the images."""
+        """Raise ShapeError unless the directions match the images, and codes are uint8."""
         check_shape("btf.images", self.images, (len(self.lights), len(self.views), -1, -1, 3))
+        if (self.encoding == "srgb") != (str(self.images.dtype).removeprefix("torch.") == "uint8"):
+            raise ShapeError(
+                f"btf.images: expected uint8 codes (encoding srgb) or floats (linear), "
+                f"got {self.images.dtype} and {self.encoding}"
+            )
         if min(self.texels) < 1:
             raise ShapeError(f"btf.images: expected at least one texel, got {self.texels[1]} x {self.texels[0]}")
 
@@ -108,10 +119,13 @@ class Btf:
             ShapeError: a value is not finite, or beyond `LARGEST` (the place is named, the others are counted).
         """
         if isinstance(self.images, Tensor):
-            band = self.images[:, :, start:stop].float()
+            stored = self.images[:, :, start:stop]
         else:
             with store.reading(str(self.images.store_path)):
-                band = torch.from_numpy(np.asarray(self.images[:, :, start:stop])).float()
+                stored = torch.from_numpy(np.asarray(self.images[:, :, start:stop]))
+        if self.encoding == "srgb":
+            return image.decode_codes(stored)
+        band = stored.float()
         wrong = ~((band <= LARGEST) & (band >= -LARGEST))
         if bool(wrong.any()):
             light, view, row, column, channel = wrong.nonzero()[0].tolist()
@@ -123,19 +137,36 @@ class Btf:
             )
         return band
 
+    def seen_from(self, view: int) -> Float[Tensor, "light H W 3"]:
+        """Return the pictures of one view as linear float32, reading no others.
+
+        Raises:
+            FormatError: the file on disk is damaged.
+        """
+        if isinstance(self.images, Tensor):
+            stored = self.images[:, view]
+        else:
+            with store.reading(str(self.images.store_path)):
+                stored = torch.from_numpy(np.asarray(self.images[:, view]))
+        return image.decode_codes(stored) if self.encoding == "srgb" else stored.float()
+
     def pictures(self) -> Float[Tensor, "light view H W 3"]:
-        """Return all pictures, read into memory, in the dtype they are stored in.
+        """Return all pictures, read into memory: in the dtype they are stored in, of codes the linear float32 values.
 
         Raises:
             ShapeError: a value is not finite.
         """
+        stored = self._stored()
+        if self.encoding == "srgb":
+            return image.decode_codes(stored)
+        check_finite("btf.images", stored)
+        return stored
+
+    def _stored(self) -> Tensor:
         if isinstance(self.images, Tensor):
-            images = self.images
-        else:
-            with store.reading(str(self.images.store_path)):
-                images = torch.from_numpy(np.asarray(self.images[:]))
-        check_finite("btf.images", images)
-        return images
+            return self.images
+        with store.reading(str(self.images.store_path)):
+            return torch.from_numpy(np.asarray(self.images[:]))
 
     def evaluate(
         self,
@@ -165,13 +196,15 @@ class Btf:
         picture = light[..., :, None] * self.views.n_nodes + view.node[..., None, :]
         index = picture[..., None] * (height * width) + taps.texel[..., None, None, :]
         weight = light_weight[..., :, None, None] * view.weight[..., None, :, None] * taps.weight[..., None, None, :]
-        values = table[index.flatten(-3)].to(uv.dtype)
+        values = table[index.flatten(-3)]
+        values = (image.decode_codes(values) if values.dtype == torch.uint8 else values).to(uv.dtype)
         return (values * weight.flatten(-3).unsqueeze(-1)).sum(-2)
 
     @cached_property
     def _nodes(self) -> Tensor:
-        """(nodes of light x nodes of view x texel, 3), the poles appended."""
-        images = self.pictures()
+        """(nodes of light x nodes of view x texel, 3), the poles appended; codes stay codes where there are none."""
+        poles = self.lights.needs_pole or self.views.needs_pole
+        images = self._stored() if self.encoding == "srgb" and not poles else self.pictures()
         with_light_pole = hemisphere.with_pole(images, self.lights, dim=0)
         return hemisphere.with_pole(with_light_pole, self.views, dim=1).reshape(-1, 3)
 
@@ -200,10 +233,13 @@ def load(path: str | Path) -> Btf:
     group = store.open_table(path, "btf")
     with store.reading(path):
         about, images = store.attributes(group), group["images"]
+        encoding = about.get("encoding", "linear")
+        if encoding not in ("linear", "srgb"):
+            raise FormatError(f"{path}: expected the encoding 'linear' or 'srgb', got '{encoding}'; update torchmeso")
         if not isinstance(images, zarr.Array):
             raise FormatError(f"{path}: expected an array 'images', got a group; the copy may be incomplete")
         lights, views = hemisphere.parse(about["lights"]), hemisphere.parse(about["views"])
-        return Btf(images=images, lights=lights, views=views, h=about["h"])
+        return Btf(images=images, lights=lights, views=views, h=about["h"], encoding=encoding)
 
 
 def save(btf: Btf, path: str | Path, *, dtype: str = "float16", **attributes: object) -> None:
@@ -222,10 +258,12 @@ def save(btf: Btf, path: str | Path, *, dtype: str = "float16", **attributes: ob
         writer.finish()
 
 
-def specs(shape: tuple[int, ...], dtype: str = "float16") -> dict[str, store.ArraySpec]:
+def specs(
+    shape: tuple[int, ...], dtype: str = "float16", *, chunk: tuple[int, ...] = (4, 1, 32, 32, 3)
+) -> dict[str, store.ArraySpec]:
     """Return the layout of a raw table: one shard per view (a block of a bake), chunks of 4 lights x 32 x 32 texels."""
     light, _, height, width, _ = shape
-    chunk = (min(light, 4), 1, min(height, 32), min(width, 32), 3)
+    chunk = (min(light, chunk[0]), 1, min(height, chunk[2]), min(width, chunk[3]), 3)
     whole = (-(-n // c) * c for n, c in zip((light, 1, height, width, 3), chunk, strict=True))
     spec = store.ArraySpec(
         shape=tuple(shape), dtype=dtype, chunks=chunk, shards=tuple(whole), axes=("light", "view", "H", "W", "C")
@@ -233,7 +271,10 @@ def specs(shape: tuple[int, ...], dtype: str = "float16") -> dict[str, store.Arr
     return {"images": spec}
 
 
-def table_attributes(lights: DirectionSet, views: DirectionSet, h: float) -> dict[str, object]:
+def table_attributes(
+    lights: DirectionSet, views: DirectionSet, h: float, encoding: Encoding = "linear"
+) -> dict[str, object]:
     """Return what a raw table says about itself."""
-    unit = "T = pi f_r cos(theta_i), linear RGB"
-    return {"kind": "btf", "lights": lights.name, "views": views.name, "h": h, "unit": unit}
+    unit = f"T = pi f_r cos(theta_i), {'sRGB codes' if encoding == 'srgb' else 'linear RGB'}"
+    about: dict[str, object] = {"kind": "btf", "lights": lights.name, "views": views.name, "h": h, "unit": unit}
+    return about if encoding == "linear" else {**about, "encoding": encoding}

@@ -1,22 +1,30 @@
-"""Pictures on disk: PNG and JPEG (sRGB) and OpenEXR (linear), as linear RGB float tensors, row 0 on top.
+"""Pictures on disk: PNG and JPEG (sRGB), OpenEXR and Radiance (linear), as linear RGB float tensors, row 0 on top.
 
 Test: tests/data/test_image.py
 """
 
 import io
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from torchmeso.data import rgbe, store
 from torchmeso.data.store import replacing
 from torchmeso.errors import FormatError, StorageError
 
+PIXELS_PER_BYTE = 8 * 1032
+"""Of a black-and-white PNG of one colour: deflate packs 1032 bytes into one at most; JPEG stays far below."""
+
+EXR_PIXELS_PER_BYTE = 1032
+"""Of an OpenEXR picture of one colour in two bytes or more."""
+
 
 def read(path: str | Path | bytes) -> Float[Tensor, "H W 3"]:
-    """Return a colour picture as linear RGB; PNG and JPEG are taken as sRGB, EXR as linear.
+    """Return a colour picture as linear RGB; PNG and JPEG are taken as sRGB, EXR and Radiance (.hdr) as linear.
 
     Args:
         path: of the file; or the content of a PNG or JPEG file.
@@ -26,7 +34,26 @@ def read(path: str | Path | bytes) -> Float[Tensor, "H W 3"]:
     """
     if not isinstance(path, bytes) and Path(path).suffix.lower() == ".exr":
         return _read_exr(Path(path))
+    if not isinstance(path, bytes) and Path(path).suffix.lower() == ".hdr":
+        return torch.from_numpy(rgbe.read(path))
     return to_linear(torch.from_numpy(_read_pillow(path, "RGB").astype(np.float32) / 255))
+
+
+def read_codes(data: bytes, name: str) -> UInt8[Tensor, "H W 3"]:
+    """Return the sRGB codes of a PNG or JPEG file, given its content; nothing is decoded before its size is checked.
+
+    Raises:
+        FormatError: the content is damaged, or far too short for the picture it announces.
+    """
+    from PIL import Image
+
+    with store.reading(name), Image.open(io.BytesIO(data), formats=("JPEG", "PNG")) as picture:
+        width, height = picture.size
+        if width * height > PIXELS_PER_BYTE * len(data):
+            raise FormatError(
+                f"{name}: announces {width} x {height} pixels, too many for {len(data)} bytes; the copy may be damaged"
+            )
+        return torch.from_numpy(np.array(picture.convert("RGB")))
 
 
 def read_data(path: str | Path) -> Float[Tensor, "H W"]:
@@ -91,6 +118,27 @@ def to_linear(srgb: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     return torch.where(srgb <= 0.04045, srgb / 12.92, ((srgb.clamp(min=0) + 0.055) / 1.055) ** 2.4)
 
 
+@lru_cache(maxsize=1)
+def srgb_table() -> Float[Tensor, "256"]:
+    """Return the linear value of each sRGB code, float32."""
+    return to_linear(torch.arange(256, dtype=torch.float64) / 255).float()
+
+
+def decode_codes(codes: UInt8[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """Return the float32 linear values of sRGB codes, through a table of 256 entries."""
+    # Indices are four times as wide as codes (bytes would be a mask), so they are made a million at a time.
+    flat = codes.reshape(-1)
+    linear = torch.empty(flat.shape, dtype=torch.float32)
+    for some, out in zip(flat.split(1 << 20), linear.split(1 << 20), strict=True):
+        torch.index_select(srgb_table(), 0, some.int(), out=out)
+    return linear.reshape(codes.shape)
+
+
+def encode_codes(linear: Float[Tensor, "*batch"]) -> UInt8[Tensor, "*batch"]:
+    """Return the nearest sRGB codes of linear values, clipped to [0, 1]: the inverse of `decode_codes`."""
+    return (to_srgb(linear.clamp(0, 1)) * 255 + 0.5).to(torch.uint8)
+
+
 def to_srgb(linear: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     """Return sRGB values of linear ones: the inverse of `to_linear`."""
     return torch.where(linear <= 0.0031308, linear * 12.92, 1.055 * linear.clamp(min=0) ** (1 / 2.4) - 0.055)
@@ -117,6 +165,10 @@ def _read_exr(path: Path) -> Tensor:
     if not path.is_file():
         raise FormatError(f"{path}: expected a picture, found none; check the path")
     try:
+        window = OpenEXR.File(str(path), header_only=True).header()["dataWindow"]
+        width, height = (int(last) - int(first) + 1 for first, last in zip(*window, strict=True))
+        if not 0 < width * height <= EXR_PIXELS_PER_BYTE * path.stat().st_size:
+            raise ValueError(f"announces {width} x {height} pixels in {path.stat().st_size} bytes")
         channels = OpenEXR.File(str(path)).channels()
     except Exception as error:  # the binding raises RuntimeError and others
         raise FormatError(f"{path}: expected an OpenEXR picture ({error}); the copy may be incomplete") from error

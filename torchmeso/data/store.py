@@ -72,7 +72,7 @@ class BlockWriter:
         """Give the finished table its name."""
         for scrap in (self._part / "table").rglob("*.partial"):  # of chunks that a killed run was writing
             scrap.unlink()
-        _replace_directory(self._part / "table", self._target)
+        replace_directory(self._part / "table", self._target)
         shutil.rmtree(self._part)
 
 
@@ -278,18 +278,7 @@ CANNOT_WRITE = {
 """What the system says where a file cannot be written."""
 
 
-def content_hash(*parts: Any) -> str:
-    """Return a short hash of JSON-like parts, the same on every machine."""
-    text = json.dumps(parts, sort_keys=True, default=str)
-    return hashlib.sha256(text.encode()).hexdigest()[:24]
-
-
-def cache_dir() -> Path:
-    """Return the folder of cached bakes: TORCHMESO_CACHE, else ~/.cache/torchmeso."""
-    return Path(os.environ.get("TORCHMESO_CACHE", Path.home() / ".cache" / "torchmeso"))
-
-
-def _replace_directory(source: Path, target: Path) -> None:
+def replace_directory(source: Path, target: Path) -> None:
     """Rename a folder over another one; the old one is only removed once the new one has its name."""
     old = target.with_name(f"{target.name}.old.part")
     if target.exists():
@@ -299,6 +288,17 @@ def _replace_directory(source: Path, target: Path) -> None:
     os.replace(source, target)
     if old.exists():
         shutil.rmtree(old)
+
+
+def content_hash(*parts: Any) -> str:
+    """Return a short hash of JSON-like parts, the same on every machine."""
+    text = json.dumps(parts, sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:24]
+
+
+def cache_dir() -> Path:
+    """Return the folder of cached bakes: TORCHMESO_CACHE, else ~/.cache/torchmeso."""
+    return Path(os.environ.get("TORCHMESO_CACHE", Path.home() / ".cache" / "torchmeso"))
 
 
 def _remove_if_left(beside: Path) -> None:

@@ -231,6 +231,20 @@ def quadrature(directions: DirectionSet) -> Float[Tensor, "direction"]:
     return torch.tensor(weights, dtype=torch.float64)
 
 
+def solid_angles(directions: DirectionSet) -> Float[Tensor, "direction"]:
+    """Return float64 solid angles that share out the hemisphere, 2 pi in all.
+
+    A ring reaches half-way to its neighbours, the first one to the pole and the last one to the horizon.
+    """
+    theta = [math.radians(t) for t in directions.theta_deg]
+    edge = [1.0, *(math.cos((a + b) / 2) for a, b in pairwise(theta)), 0.0]
+    shares = [
+        2 * math.pi * (upper - lower) / n for (upper, lower), n in zip(pairwise(edge), directions.count, strict=True)
+    ]
+    each = [share for share, n in zip(shares, directions.count, strict=True) for _ in range(n)]
+    return torch.tensor(each, dtype=torch.float64)
+
+
 class Rings(NamedTuple):
     """The rings of a set as arrays, the pole among them where the set needs one."""
 

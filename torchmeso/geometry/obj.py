@@ -7,6 +7,7 @@ Test: tests/geometry/test_obj.py
 """
 
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -26,46 +27,73 @@ def read(path: Path) -> MeshFile:
         GeometryError: there are no triangles, or coordinates that are not finite.
     """
     text = path.read_text(encoding="utf-8", errors="replace").replace("\\\n", " ")
-    positions, textures, polygons, groups, libraries = [], [], [], [], []
-    names: dict[str, int] = {}
-    group = -1
-    for line in text.splitlines():
-        key, _, rest = line.strip().partition(" ")
-        if key == "v":
-            positions.append(rest)
-        elif key == "vt":
-            textures.append(rest)
-        elif key == "f":
-            if group < 0:
-                group = names.setdefault("", len(names))
-            if "-" in rest:
-                rest = _absolute(rest, len(positions), len(textures))
-            polygons.append(rest.partition("#")[0])
-            groups.append(group)
-        elif key == "usemtl":
-            group = names.setdefault(rest.strip(), len(names))
-        elif key == "mtllib":
-            libraries.append(rest.strip())
     try:
-        vertices = _columns(positions, 3)
-        corners, part = _triangles(polygons, np.array(groups, dtype=np.int64))
-        uv = _columns(textures, 2) if len(textures) and bool((corners[..., 1] >= 0).all()) else None
+        lines = _scan(text)
+        vertices = _columns(lines.positions, 3)
+        corners, part = _triangles(lines.polygons, np.array(lines.groups, dtype=np.int64))
+        uv = _columns(lines.textures, 2) if len(lines.textures) and bool((corners[..., 1] >= 0).all()) else None
         source, faces = _join(corners, uv is not None)
         used_vertices = vertices[source[:, 0]]
         used_uv = None if uv is None else torch.from_numpy(uv[source[:, 1]]).float()
     except GeometryError:
         raise
-    except (ValueError, IndexError) as error:
+    except (ValueError, IndexError, OverflowError) as error:
         raise FormatError(f"{path}: expected an OBJ file ({error})") from error
-    looks = {k: v for library in libraries for k, v in _read_mtl(path.parent / library).items()}
+    looks = {k: v for library in lines.libraries for k, v in _read_mtl(path.parent / library).items()}
     return MeshFile(
         vertices=torch.from_numpy(used_vertices),
         faces=torch.from_numpy(faces),
         uv=used_uv,
         part=torch.from_numpy(part),
-        groups=tuple(Group(name, looks.get(name)) for name in names),
+        groups=tuple(Group(name, looks.get(name)) for name in lines.names),
         uv_sets=int(uv is not None),
     )
+
+
+class _Lines(NamedTuple):
+    """What the lines of a file say, in their order.
+
+    Attributes:
+        positions: coordinates of the vertices.
+        textures: texture coordinates.
+        polygons: corners of the faces, counted from the start of the file.
+        groups: of every polygon, the place of its material in `names`.
+        libraries: names of MTL files.
+        names: names of materials.
+    """
+
+    positions: list[str]
+    textures: list[str]
+    polygons: list[str]
+    groups: list[int]
+    libraries: list[str]
+    names: list[str]
+
+
+def _scan(text: str) -> _Lines:
+    """Sort the lines of a file by what they hold."""
+    found = _Lines([], [], [], [], [], [])
+    number: dict[str, int] = {}
+    group = -1
+    for line in text.splitlines():
+        key, _, rest = line.strip().partition(" ")
+        if key == "v":
+            found.positions.append(rest)
+        elif key == "vt":
+            found.textures.append(rest)
+        elif key == "f":
+            if group < 0:
+                group = number.setdefault("", len(number))
+            if "-" in rest:
+                rest = _absolute(rest, len(found.positions), len(found.textures))
+            found.polygons.append(rest.partition("#")[0])
+            found.groups.append(group)
+        elif key == "usemtl":
+            group = number.setdefault(rest.strip(), len(number))
+        elif key == "mtllib":
+            found.libraries.append(rest.strip())
+    found.names.extend(number)
+    return found
 
 
 def _columns(lines: list[str], count: int) -> np.ndarray:

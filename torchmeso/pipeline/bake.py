@@ -10,12 +10,12 @@ import hashlib
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
-from torchmeso.compress import eigen
+from torchmeso.compress import double_sh, eigen
 from torchmeso.config import Config, MaterialConfig, MesoConfig
-from torchmeso.data import btf, eigen_btf, mdf, store, textured
+from torchmeso.data import btf, eigen_btf, mdf, sh_btf, store, textured
 from torchmeso.errors import ConfigError, FormatError
 from torchmeso.geometry.mesh_file import Finish
 from torchmeso.meso import bake_btf, bake_mdf
@@ -75,12 +75,23 @@ def prepare_material(name: str, material: MaterialConfig, report: Report = silen
     if not model.exists():
         btf_table, mdf_table = bake_tables(name, material, report, seconds)
         start = time.perf_counter()
-        fitted = eigen.fit(btf.load(btf_table), material.eigen, progress=lambda x: report(f"{name}: eigen BTF", x))
+        _compress(name, btf_table, mdf_table, material, model, report)
         seconds["compress"] = time.perf_counter() - start
-        eigen_btf.save(fitted, model, silhouette=mdf.load(mdf_table))
     raw = sum(_size_on_disk(p) for p in table_paths(material))
     opened = open_model(model, depth=depth)
     return Asset(material=opened, seconds=seconds, raw_bytes=raw, model_bytes=model.stat().st_size)
+
+
+def _compress(name: str, btf_table: Path, mdf_table: Path, material: MaterialConfig, out: Path, report: Report) -> None:
+    """Fit the kind of model that the material asks for, and write it with the MDF."""
+    table, depth = btf.load(btf_table), mdf.load(mdf_table)
+    if material.double_sh is not None:
+        told = partial(report, f"{name}: double-SH BTF")
+        model = double_sh.fit(table, material.double_sh, backend="auto", progress=told)
+        sh_btf.save(model, out, silhouette=depth)
+    else:
+        told = partial(report, f"{name}: eigen BTF")
+        eigen_btf.save(eigen.fit(table, material.eigen, progress=told), out, silhouette=depth)
 
 
 def plain(finish: Finish) -> Material:
@@ -144,12 +155,17 @@ def open_model(path: str | Path, *, depth: bool = True, rank: int | None = None)
     Args:
         path: the model.
         depth: whether to read the MDF.
-        rank: components of the eigen BTF to read; all of them where it is None.
+        rank: components of the eigen BTF to read; all of them where it is None. Of a double-SH BTF the bands.
 
     Raises:
-        FormatError: the file is missing, damaged, or holds no eigen BTF.
+        FormatError: the file is missing, damaged, or holds no BTF.
     """
-    return Material(btf=eigen_btf.load(path, rank=rank), mdf=mdf.from_model(store.Model(path)) if depth else None)
+    model = store.Model(path)
+    if "sh" in model.meta:
+        reflectance = sh_btf.load(path, degree=None if rank is None else rank - 1)
+    else:
+        reflectance = eigen_btf.load(path, rank=rank)
+    return Material(btf=reflectance, mdf=mdf.from_model(model) if depth else None)
 
 
 def table_paths(material: MaterialConfig) -> tuple[Path, Path]:
@@ -160,7 +176,8 @@ def table_paths(material: MaterialConfig) -> tuple[Path, Path]:
 
 def model_path(material: MaterialConfig) -> Path:
     """Return where the cache keeps the run-time model of a material."""
-    return store.cache_dir() / f"{store.content_hash(_keys(material), asdict(material.eigen))}.meso"
+    kind = asdict(material.eigen) if material.double_sh is None else ["double-sh", asdict(material.double_sh)]
+    return store.cache_dir() / f"{store.content_hash(_keys(material), kind)}.meso"
 
 
 @cache

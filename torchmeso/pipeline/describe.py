@@ -3,16 +3,18 @@
 Test: tests/pipeline/test_describe.py
 """
 
+import math
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from torchmeso import config
-from torchmeso.data import btf, btfdbb, image, mdf, store
+from torchmeso.data import btf, btfdbb, hsh, image, mdf, picture_set, ptm, rti, store
 from torchmeso.errors import FormatError, human_size
 from torchmeso.geometry import mesh, mesh_file, unwrap
 from torchmeso.geometry.mesh_file import Group
+from torchmeso.pipeline import picture_sets
 
 
 def file(path: str | Path) -> dict[str, Any]:
@@ -31,18 +33,22 @@ def file(path: str | Path) -> dict[str, Any]:
         return _mdf(path)
     if name.endswith(".btf"):
         return _bonn(path)
+    if picture_sets.is_one(path):
+        return _picture_set(path)
     if name.endswith(".meso"):
         return _model(path)
+    if name.endswith((".lp", ".ptm", ".rti")):
+        return _rti(path)
     if name.endswith((".yaml", ".yml")):
         return _config(path)
-    if name.endswith((".png", ".jpg", ".jpeg", ".exr")):
+    if name.endswith((".png", ".jpg", ".jpeg", ".exr", ".hdr")):
         rgb = image.read(path)
         return {"kind": "picture", "size": f"{rgb.shape[1]} x {rgb.shape[0]}", "largest value": float(rgb.max())}
     if name.endswith((".obj", ".ply", ".glb", ".gltf", ".off", ".stl")):
         return _mesh(path)
     raise FormatError(
         f"{path}: expected a table (.btf.zarr, .mdf.zarr, .btf), a model (.meso), a configuration (.yaml), "
-        "a picture or a mesh"
+        "a folder or zip of the pictures of a BTF, an RTI file (.lp, .ptm, .rti), a picture or a mesh"
     )
 
 
@@ -55,7 +61,23 @@ def _btf(path: Path) -> dict[str, Any]:
         "views": f"{len(table.views)}, {table.views.name}",
         "texels": f"{table.texels[1]} x {table.texels[0]}",
         "slab depth (tiles)": table.h,
+        **({"filled in": store.attributes(group)["filled"]} if "filled" in store.attributes(group) else {}),
         **_origin(store.attributes(group)),
+        "on disk": _size(path),
+    }
+
+
+def _picture_set(path: Path) -> dict[str, Any]:
+    found = picture_sets.survey(path)
+    height, width = picture_set.size(found)
+    return {
+        "kind": "BTF in pictures",
+        "lights": f"{len(found.lights)}, {found.lights.name}",
+        "views": f"{len(found.views)}, {found.views.name}",
+        "texels": f"{width} x {height}",
+        "values": "sRGB codes" if found.encoding == "srgb" else "linear",
+        "pictures": len(found.files),
+        "missing": found.missing_text(),
         "on disk": _size(path),
     }
 
@@ -81,6 +103,22 @@ def _bonn(path: Path) -> dict[str, Any]:
         **{name: value for name, value in notes.items() if value},
         "on disk": _size(path),
     }
+
+
+def _rti(path: Path) -> dict[str, Any]:
+    if path.suffix.lower() == ".lp":
+        lights = rti.read(path)
+        height, width, _ = next(lights.pictures()).shape
+        last = math.degrees(math.acos(float(lights.directions[:, 2].clamp(-1, 1).min())))
+        about = {"kind": "RTI picture set", "lights": len(lights.files), "lowest light": f"{last:.0f} deg from above"}
+    elif path.suffix.lower() == ".ptm":
+        found = ptm.read(path)
+        height, width, planes, _ = found.codes.shape
+        about = {"kind": "polynomial texture map", "format": "LRGB" if planes == 1 else "RGB"}
+    else:
+        height, width, _, terms = hsh.read(path).codes.shape
+        about = {"kind": "hemispherical harmonics map", "terms": terms}
+    return {**about, "texels": f"{width} x {height}", "on disk": _size(path)}
 
 
 def _mdf(path: Path) -> dict[str, Any]:
@@ -111,6 +149,18 @@ def _model(path: Path) -> dict[str, Any]:
             "texels": f"{first.shape[2]} x {first.shape[1]}",
             "storage": str(first.dtype).removeprefix("torch."),
             "BTF data": _held(model, "eigen."),
+        }
+    if "sh" in model.meta:
+        sh = model.meta["sh"]
+        first = model.read("sh.map.0.0")
+        about |= {
+            "coefficients": "{} x {} of light and view".format(*sh["terms"]),
+            "domain": sh["domain"],
+            "lights": sh["lights"],
+            "views": sh["views"],
+            "texels": f"{first.shape[3]} x {first.shape[2]}",
+            "storage": str(first.dtype).removeprefix("torch."),
+            "BTF data": _held(model, "sh."),
         }
     if "mdf" in model.meta:
         about["MDF"] = f"{model.meta['mdf']['directions']}, h = {model.meta['mdf']['h']:g} tiles"

@@ -1,4 +1,4 @@
-"""Files for other programs: meshes and configurations as GLB with tangents, BTFs as Bonn's `.btf`.
+"""Files for other programs: meshes and configurations as GLB with tangents, BTFs as EXR pictures or Bonn's `.btf`.
 
 Test: tests/pipeline/test_export.py
 """
@@ -9,7 +9,7 @@ from typing import Literal
 from torchmeso import config
 from torchmeso.compress import dfmf
 from torchmeso.compress.dfmf import DfmfOptions
-from torchmeso.data import btf_file, btfdbb_write
+from torchmeso.data import btf, btf_file, btfdbb_write, exr_stack
 from torchmeso.data.store import replacing
 from torchmeso.errors import ConfigError
 from torchmeso.geometry import glb, mesh, mesh_file
@@ -36,6 +36,16 @@ def to_glb(path: str | Path, out: str | Path) -> None:
         bodies = [Body(path.stem, dressed, part, found.groups)]
     with replacing(out) as beside:
         beside.write_bytes(glb.encode(bodies))
+
+
+def to_exr_stack(path: str | Path, out: str | Path, report: Report = silent) -> None:
+    """Write the BTF of a raw table (.btf.zarr) as the folder `out`: EXR pictures and their directions.
+
+    Raises:
+        FormatError: the table is missing or damaged.
+        StorageError: the disk is full, or the place cannot be written to.
+    """
+    exr_stack.write(btf.load(path), out, progress=lambda x: report("pictures", x))
 
 
 def to_bonn(

@@ -15,18 +15,20 @@ import torch
 from jaxtyping import Bool, Float, Int, Int32, UInt8, UInt16
 from torch import Tensor
 
+from torchmeso.algebra import spherical_harmonics
 from torchmeso.backends import opencl
 from torchmeso.data.eigen_btf import EigenBtf
 from torchmeso.data.mdf import Mdf
 from torchmeso.data.relief import CODES as RELIEF_CODES
+from torchmeso.data.sh_btf import ShBtf
 from torchmeso.data.textured import Textured
 from torchmeso.errors import BackendError
 from torchmeso.geometry import hemisphere
 from torchmeso.geometry.hemisphere import DirectionSet
 from torchmeso.render.scene import Material
 
-BLOCK, GROUP = 64, 4
-"""Bytes that tables are aligned to, and components that stand in one vector."""
+BLOCK, GROUP, MOST_TERMS = 64, 4, 64
+"""Bytes that tables are aligned to, components that stand in one vector, and the most harmonics of light or view."""
 
 REFLECTANCE = np.dtype(
     [(name, "i4") for name in ("there", "height", "width", "groups", "codes", "light_rings", "light_count")]
@@ -34,9 +36,10 @@ REFLECTANCE = np.dtype(
     + [(name, "i4") for name in ("ambient_scale", "ambient_offset", "levels", "level_count")]
     + [("last_cosine", "f4"), ("albedo", "f4", 3)]
     + [(name, "i4") for name in ("normals", "normal_levels", "normal_level_count")]
-    + [("pad", "i4", 7)]
+    + [(name, "i4") for name in ("light_steps", "light_degree", "view_steps", "view_degree")]
+    + [("view_last_cosine", "f4"), ("pad", "i4", 2)]
 )
-EIGEN, TEXTURED = 1, 2
+EIGEN, TEXTURED, HARMONIC = 1, 2, 3
 """What stands in a reflectance's `there`; 0 = a plain colour."""
 
 MDF = np.dtype(
@@ -59,6 +62,8 @@ ADDRESSES = {
         "levels",
         "normals",
         "normal_levels",
+        "light_steps",
+        "view_steps",
     ),
     MDF: ("rings", "delta", "missing", "relief", "plateau", "hole"),
 }
@@ -73,6 +78,7 @@ class DeviceMaterials(NamedTuple):
         mdfs: (surface,) see `MDF`.
         reflectances: (surface,) see `REFLECTANCE`.
         textured: whether any surface has a mesostructure.
+        harmonic: whether any surface has a double-SH BTF.
         parts: the BTFs and MDFs in `tables`, by identity.
         packed: how many of them were uploaded, not taken over.
     """
@@ -81,6 +87,7 @@ class DeviceMaterials(NamedTuple):
     mdfs: "opencl.Buffer"
     reflectances: "opencl.Buffer"
     textured: bool
+    harmonic: bool
     parts: "dict[tuple[int, bool], _Part]"
     packed: int
 
@@ -108,7 +115,7 @@ def upload_materials(
     Raises:
         BackendError: there is no device, or a material is of a kind that kernels do not read.
     """
-    wanted: dict[tuple[int, bool], EigenBtf | Textured | Mdf] = {}
+    wanted: dict[tuple[int, bool], EigenBtf | ShBtf | Textured | Mdf] = {}
     for m in materials:
         if m.btf is not None:
             wanted[id(m.btf), ambient] = _readable(m.btf)
@@ -129,12 +136,15 @@ def upload_materials(
         if m.mdf is not None and silhouettes:
             mdfs[i] = _placed(parts[id(m.mdf), False])
     textured = bool(mdfs["there"].any())
-    return DeviceMaterials(tables, opencl.upload(mdfs), opencl.upload(reflectances), textured, parts, len(new))
+    harmonic = bool((reflectances["there"] == HARMONIC).any())
+    return DeviceMaterials(
+        tables, opencl.upload(mdfs), opencl.upload(reflectances), textured, harmonic, parts, len(new)
+    )
 
 
 def _join(
     kept: "dict[tuple[int, bool], _Part]",
-    new: "dict[tuple[int, bool], EigenBtf | Textured | Mdf]",
+    new: "dict[tuple[int, bool], EigenBtf | ShBtf | Textured | Mdf]",
     before: DeviceMaterials | None,
 ) -> "tuple[opencl.Buffer, dict[tuple[int, bool], _Part]]":
     """Return a buffer with the parts that are `kept`, copied on the device, and behind them the `new` ones."""
@@ -148,6 +158,8 @@ def _join(
         pool = _Pool()
         if isinstance(source, EigenBtf):
             record = _reflectance(pool, source, ambient=key[1])
+        elif isinstance(source, ShBtf):
+            record = _harmonics(pool, source)
         else:
             record = _pictures(pool, source) if isinstance(source, Textured) else _mdf(pool, source)
         arrays.append(pool.joined())
@@ -171,9 +183,16 @@ def _placed(part: _Part) -> np.void:
     return record[0]
 
 
-def _readable(btf: object) -> EigenBtf | Textured:
-    if not isinstance(btf, EigenBtf | Textured):
-        raise BackendError(f"opencl: expected an eigen BTF, got {type(btf).__name__}; use the torch backend")
+def _readable(btf: object) -> EigenBtf | ShBtf | Textured:
+    if not isinstance(btf, EigenBtf | ShBtf | Textured):
+        raise BackendError(
+            f"opencl: expected an eigen or double-SH BTF, got {type(btf).__name__}; use the torch backend"
+        )
+    if isinstance(btf, ShBtf) and max(btf.terms) > MOST_TERMS:
+        raise BackendError(
+            f"opencl: expected at most {MOST_TERMS} coefficients of light or view, got {max(btf.terms)}; "
+            "use the torch backend"
+        )
     return btf
 
 
@@ -206,6 +225,35 @@ def _reflectance(pool: "_Pool", btf: EigenBtf, *, ambient: bool) -> np.ndarray:
         record["ambient"] = pool.add(_grouped(values).numpy())
         record["ambient_scale"], record["ambient_offset"] = (pool.add(_grouped(x).numpy()) for x in (unit, zero))
     record["last_cosine"] = math.cos(btf.lights.last)
+    return record
+
+
+def _harmonics(pool: "_Pool", btf: ShBtf) -> np.ndarray:
+    record = np.zeros(1, REFLECTANCE)
+    k_l, k_v = btf.terms
+    groups = -(-k_v // GROUP)
+    codes = btf.maps.dtype == torch.uint8
+
+    def grouped(x: Tensor) -> Tensor:
+        """Return (k_l, k_v, ..., 3) as (..., k_l, group, 16): four coefficients of the view, rgb and nothing."""
+        padded = torch.nn.functional.pad(x.movedim((0, 1), (-3, -2)), (0, 1, 0, groups * GROUP - k_v))
+        return padded.unflatten(-2, (groups, GROUP)).flatten(-2)
+
+    levels = [grouped(x if codes else x.float()).flatten(0, 1) for x in btf.levels]
+    first = np.cumsum([0, *(len(x) for x in levels[:-1])]) * k_l * groups
+    records = np.stack([first, 0 * first, *np.array([x.shape[2:4] for x in btf.levels]).T], 1).astype(np.int32)
+    record["there"], record["height"], record["width"] = HARMONIC, *btf.texels
+    record["groups"], record["codes"] = groups, codes
+    record["maps"] = pool.add(torch.cat(levels).numpy())
+    record["levels"], record["level_count"] = pool.add(records), len(levels)
+    record["scale"] = pool.add(grouped(btf.scale.float()).contiguous().numpy())
+    record["offset"] = pool.add(grouped(btf.offset.float()).contiguous().numpy())
+    record["ambient"] = pool.add(btf.everywhere.float().numpy())
+    for side, terms in (("light", k_l), ("view", k_v)):
+        degree = spherical_harmonics.degree_of(terms)
+        record[f"{side}_steps"] = pool.add(spherical_harmonics.recurrence(degree))
+        record[f"{side}_degree"] = degree
+    record["last_cosine"], record["view_last_cosine"] = math.cos(btf.lights.last), math.cos(btf.views.last)
     return record
 
 

@@ -97,7 +97,12 @@ class Renderer:
         textured = self._on_device.materials.textured or not self._skips.plain
         mode = {"none": 0, "paper": 1, "curved": 2}[self.options.silhouette] if textured else 0
         mixed = mode != 0 and self._on_device.mixed
-        self._defines = (f"-DSILHOUETTE={mode}", *(["-DONE_LAYER"] * self._one_layer), *(["-DMIXED"] * mixed))
+        wanted = (
+            ("-DONE_LAYER", self._one_layer),
+            ("-DMIXED", mixed),
+            ("-DHARMONICS", self._on_device.materials.harmonic),
+        )
+        self._defines = (f"-DSILHOUETTE={mode}", *(name for name, needed in wanted if needed))
         self._plain = mode == 0 and self.options.silhouette != "none"
         self._cull = mode == 0 and self._skips.hidden  # where no surface has depth, faces turned away hide nothing
 

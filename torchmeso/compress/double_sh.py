@@ -1,0 +1,265 @@
+"""Fit a double-SH BTF: spherical harmonics over the light, then over the view, texel by texel.
+
+leung2007tileable, section 3.1 and appendix. Every picture's samples over the light become k_l coefficients, whose
+values over the view become k_v coefficients each. Both stages are constrained least squares (`algebra.secular`): the
+energy of a vector of coefficients stays under
+
+    E = energy * sum of omega_j f_j^2,
+
+the energy of what it stands for over the hemisphere, omega_j the solid angle that a direction stands for
+(`hemisphere.solid_angles`). Harmonics that are orthonormal over the sphere then have no more energy than the
+hemisphere shows, which suppresses the large, opposed coefficients that cancel there and amplify noise.
+
+Columns (texels and channels) do not see each other: bands of texel rows of any height give the same bits. Before
+they are quantised the coefficients are kept in float16, whose step is far below that of uint8.
+
+Kernel: kernels_cl/compress/double_sh.cl          Test: tests/compress/test_double_sh.py
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Shaped
+from torch import Tensor
+
+from torchmeso.algebra import secular
+from torchmeso.algebra.secular import Factors
+from torchmeso.algebra.spherical_harmonics import basis, degree_of
+from torchmeso.backends import BackendChoice, opencl
+from torchmeso.compress.quantize import Storage, quantize
+from torchmeso.data.btf import Bands
+from torchmeso.data.sh_btf import ShBtf
+from torchmeso.errors import ShapeError, check_range
+from torchmeso.geometry.hemisphere import DirectionSet, solid_angles
+
+BAND_BYTES = 128 << 20
+"""Memory of one band of texel rows."""
+
+COLUMNS = 2048
+"""Columns that go through both stages before the next ones do: what stands between them stays in the cache."""
+
+REGISTERS = 26
+"""Sums that the kernel holds at once, of 32 vector registers."""
+
+LANES, GROUPS = 16, 4
+"""Columns that a work-item fits at once, and how often: as in the kernel."""
+
+Progress = Callable[[float], None]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DoubleShOptions:
+    """How to compress.
+
+    Attributes:
+        light_terms: k_l: 1, 4, 9, 16, 25 or 36.
+        view_terms: k_v.
+        energy: bound of the coefficients' energy, of the energy that the samples show; None = plain least squares.
+        storage: uint8, float16 or float32.
+        regularise: let directions that cannot tell the coefficients apart pass, with the smallest coefficients.
+    """
+
+    light_terms: int = 25
+    view_terms: int = 25
+    energy: float | None = 1.0
+    storage: Storage = "uint8"
+    regularise: bool = False
+
+    def __post_init__(self) -> None:
+        """Raise ConfigError for terms that are no whole bands, or an energy that bounds nothing."""
+        degree_of(self.light_terms)
+        degree_of(self.view_terms)
+        if self.energy is not None:
+            check_range("compress.energy", self.energy, 0, 1e6)
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Side:
+    """The light or the view: what turns samples over its directions into coefficients.
+
+    Attributes:
+        factors: of the basis at the directions.
+        share: (direction) what a squared sample adds to the bound of the energy; None = no bound.
+    """
+
+    factors: Factors
+    share: Float[Tensor, "direction"] | None
+
+    @property
+    def terms(self) -> int:
+        """Number of coefficients."""
+        return len(self.factors.values)
+
+
+def side(what: str, directions: DirectionSet, terms: int, options: DoubleShOptions) -> Side:
+    """Return the light's or the view's side of a fit.
+
+    Raises:
+        ConfigError: the directions cannot tell so many coefficients apart.
+    """
+    Y = basis(directions.directions(torch.float64), degree_of(terms))
+    factors = secular.factorise(Y, f"compress: {what} ({directions.name})", regularise=options.regularise)
+    share = None if options.energy is None else options.energy * solid_angles(directions)
+    return Side(factors=factors, share=share)
+
+
+def fit(
+    btf: Bands,
+    options: DoubleShOptions | None = None,
+    *,
+    backend: BackendChoice = "torch",
+    progress: Progress = lambda share: None,
+) -> ShBtf:
+    """Return the double-SH BTF of `btf`.
+
+    Args:
+        btf: in memory or on disk.
+        options: terms, bound and storage.
+        backend: torch, opencl, or auto.
+        progress: called with the share done, 0..1.
+
+    Raises:
+        ConfigError: the directions cannot tell so many coefficients apart.
+        ShapeError: a value of the BTF is not finite.
+    """
+    options = options or DoubleShOptions()
+    light = side("light", btf.lights, options.light_terms, options)
+    view = side("view", btf.views, options.view_terms, options)
+    height, width = btf.texels
+    found = torch.empty(light.terms * view.terms, height, width * 3, dtype=torch.float16)
+    for rows, samples in _bands(btf):
+        c = project(samples, light, view, backend=backend).flatten(0, 1)
+        found[:, rows] = _in_half(c, f"rows {rows.start} to {rows.stop - 1}").unflatten(1, (-1, width * 3))
+        progress(0.9 * rows.stop / height)
+    maps, scale, offset = quantised(found.unflatten(2, (width, 3)), options.storage)
+    progress(1.0)
+    terms = light.terms, view.terms
+    return ShBtf(
+        maps=maps.unflatten(0, terms), scale=scale.unflatten(0, terms), offset=offset.unflatten(0, terms),
+        lights=btf.lights, views=btf.views,
+    )  # fmt: skip
+
+
+def project(
+    samples: Shaped[Tensor, "light view column"],
+    light: Side,
+    view: Side,
+    *,
+    unit: float = 1.0,
+    backend: BackendChoice = "torch",
+) -> Float[Tensor, "k_l k_v column"]:
+    """Return the coefficients of columns of samples, one stage after the other.
+
+    Args:
+        samples: uint8, float32, or float64 on torch; a column is a channel of a texel.
+        light: turns the values over the lights into k_l coefficients.
+        view: turns those over the views into k_v coefficients.
+        unit: T of a sample of 1: 1 / 255 for bytes of linear values.
+        backend: torch computes in the dtype of the samples.
+    """
+    if opencl.resolve(backend) == "opencl":
+        return _project_opencl(samples, light, view, unit)
+    found = []
+    for part in samples.split(COLUMNS, 2):
+        values = (part if part.is_floating_point() else part.float()) * unit
+        found.append(_stage(_stage(values, light).movedim(1, 0), view).movedim(1, 0))
+    return torch.cat(found, 2)
+
+
+def _stage(samples: Float[Tensor, "direction row column"], by: Side) -> Float[Tensor, "k row column"]:
+    """Return coefficients in place of the samples."""
+    columns = samples.movedim(0, -1)
+    energy = None if by.share is None else columns.square() @ by.share.to(columns.dtype)
+    return secular.solve(by.factors, columns, energy).c.movedim(-1, 0)
+
+
+class _Strided(NamedTuple):
+    """Samples or coefficients in a buffer: value k of a row's column lies at first + k step + row stride + column."""
+
+    buffer: "opencl.Buffer"
+    first: int
+    step: int
+    stride: int
+
+
+def _project_opencl(samples: Tensor, light: Side, view: Side, unit: float) -> Tensor:
+    columns, views = samples.shape[2], samples.shape[1]
+    if columns < LANES:  # the kernel takes sixteen at a time
+        padded = torch.nn.functional.pad(samples, (0, LANES - columns))
+        return _project_opencl(padded, light, view, unit)[:, :, :columns].contiguous()
+    samples = samples if samples.is_contiguous() and samples.data_ptr() % 64 == 0 else samples.contiguous().clone()
+    width = min(COLUMNS, columns)
+    between = torch.empty(views, light.terms, width)
+    out = torch.empty(light.terms, view.terms, columns)
+    device, device_between, device_out = (opencl.buffer(x) for x in (samples, between, out))
+    tables = _device_factors(light), _device_factors(view)
+    for at in range(0, columns, width):
+        begin = min(at, columns - width)  # the last chunk is as wide as the others, and does some columns again
+        raw = _Strided(device, begin, views * columns, columns)
+        half = _Strided(device_between, 0, width, light.terms * width)
+        _enqueue(light, tables[0], raw, half, views, width, unit, codes=samples.dtype == torch.uint8)
+        turned = _Strided(device_between, 0, light.terms * width, width)
+        whole = _Strided(device_out, begin, columns, view.terms * columns)
+        _enqueue(view, tables[1], turned, whole, light.terms, width, 1.0)
+    opencl.read([(device_out, out)])
+    return out
+
+
+def _device_factors(by: Side) -> "opencl.Buffer":
+    """Return the kernel's `Factors`."""
+    f = by.factors
+    share = torch.zeros(len(f.left), dtype=torch.float64) if by.share is None else by.share
+    square = torch.where(f.values > 0, f.values.square(), 1)
+    return opencl.upload(torch.cat([x.flatten() for x in (f.left, share, f.values, square, f.right)]).float().numpy())
+
+
+def _enqueue(
+    by: Side,
+    table: "opencl.Buffer",
+    source: _Strided,
+    target: _Strided,
+    rows: int,
+    columns: int,
+    unit: float,
+    *,
+    codes: bool = False,
+) -> None:
+    """Put the fit of rows x columns vectors into the queue."""
+    terms = by.terms
+    block = -(-terms // -(-terms // REGISTERS))
+    options = [f"-DSAMPLES={len(by.factors.left)}", f"-DTERMS={terms}", f"-DBLOCK={block}"]
+    options += ["-DCODES"] * codes + ["-DCONSTRAINED"] * (by.share is not None)
+    run = opencl.kernel("compress/double_sh.cl", "fit", tuple(options))
+    places = [np.int64(x) for x in (*source[1:], *target[1:])]
+    size = -(-columns // (LANES * GROUPS)), rows
+    run(opencl.queue(), size, (1, 1), table, source.buffer, target.buffer, np.int32(columns), *places, np.float32(unit))
+
+
+def _bands(btf: Bands) -> Iterator[tuple[slice, Float[Tensor, "light view column"]]]:
+    """Yield bands of texel rows, and their columns."""
+    height, width = btf.texels
+    row_bytes = len(btf.lights) * len(btf.views) * width * 3 * 4
+    step = max(1, min(height, BAND_BYTES // row_bytes))
+    for start in range(0, height, step):
+        rows = slice(start, min(start + step, height))
+        yield rows, btf.rows(rows.start, rows.stop).flatten(2)
+
+
+def _in_half(c: Float[Tensor, "k column"], where: str) -> Float[Tensor, "k column"]:
+    """Return coefficients in float16, which ends at 65,504."""
+    half = c.half()
+    if not bool(torch.isfinite(half).all()):
+        raise ShapeError(
+            f"compress: expected coefficients up to 65,504, got {float(c.abs().max()):g} in {where}; scale the BTF down"
+        )
+    return half
+
+
+def quantised(found: Float[Tensor, "k H W 3"], storage: Storage) -> tuple[Tensor, Tensor, Tensor]:
+    """Return codes, scale and offset of every coefficient and channel."""
+    parts = [quantize(c.float()[..., None, :], storage) for c in found]
+    codes, scale, offset = (torch.stack(x).squeeze(-2) for x in zip(*parts, strict=True))
+    return codes, scale, offset

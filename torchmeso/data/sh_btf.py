@@ -1,0 +1,234 @@
+"""The double-SH BTF, a run-time model: T(uv, wi, wo) = sum_ij C_ij(uv) y_i(wi) y_j(wo).
+
+leung2007tileable, section 3.1: every texel and channel holds a matrix of k_l x k_v coefficients of real spherical
+harmonics (`algebra.spherical_harmonics`), stored as uint8 with a scale and an offset per coefficient and channel, or
+as float16 or float32. Interpolation is linear, so it runs on the codes.
+
+The coefficients describe the measured part of the hemisphere. Beyond the last ring of directions T is the ring's
+value, times cos(theta_i) / cos(last) along the light: as for every BTF of this package, and C0 at the horizon, which
+the harmonics alone are not.
+
+Test: tests/data/test_sh_btf.py
+"""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import torch
+from jaxtyping import Float, Shaped
+from torch import Tensor
+
+from torchmeso.algebra.spherical_harmonics import basis, degree_of
+from torchmeso.data import address, mdf, pyramid, store
+from torchmeso.data.btf import horizon_falloff
+from torchmeso.data.mdf import Mdf
+from torchmeso.data.pyramid import Footprint
+from torchmeso.errors import FormatError, ShapeError, check_finite, check_shape
+from torchmeso.geometry import hemisphere
+from torchmeso.geometry.directions import from_angles, to_angles
+from torchmeso.geometry.hemisphere import DirectionSet
+
+POINTS = 4096
+"""Evaluated at a time: their coefficients stay in the cache."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ShBtf:
+    """Coefficients of a BTF in spherical harmonics of light and view.
+
+    Attributes:
+        maps: (k_l, k_v, H, W, 3) codes of C: uint8, float16, float32 or float64.
+        scale: (k_l, k_v, 3) C = offset + scale * code.
+        offset: (k_l, k_v, 3).
+        lights: directions towards the light that it was fitted to.
+        views: directions towards the viewer that it was fitted to.
+    """
+
+    maps: Shaped[Tensor, "k_l k_v H W 3"]
+    scale: Float[Tensor, "k_l k_v 3"]
+    offset: Float[Tensor, "k_l k_v 3"]
+    lights: DirectionSet
+    views: DirectionSet
+
+    def __post_init__(self) -> None:
+        """Raise ShapeError or ConfigError unless the parts match."""
+        check_shape("sh.maps", self.maps, (-1, -1, -1, -1, 3))
+        check_shape("sh.scale", self.scale, (*self.terms, 3))
+        check_shape("sh.offset", self.offset, (*self.terms, 3))
+        for terms in self.terms:
+            degree_of(terms)
+        if self.maps.dtype != torch.uint8 and not self.maps.is_floating_point():
+            raise ShapeError(f"sh.maps: expected uint8 or a float type, got {self.maps.dtype}")
+        if min(self.texels) < 1:
+            raise ShapeError(f"sh.maps: expected at least one texel, got {self.texels[1]} x {self.texels[0]}")
+        check_finite("sh.scale", self.scale)
+        check_finite("sh.offset", self.offset)
+        if self.maps.is_floating_point():
+            check_finite("sh.maps", self.maps)
+
+    @property
+    def terms(self) -> tuple[int, int]:
+        """Coefficients over light and view, k_l and k_v."""
+        return self.maps.shape[0], self.maps.shape[1]
+
+    @property
+    def texels(self) -> tuple[int, int]:
+        """Height and width of the texture."""
+        return self.maps.shape[2], self.maps.shape[3]
+
+    def truncated(self, light_terms: int, view_terms: int) -> "ShBtf":
+        """Return the model with its first coefficients only, whole bands: 1, 4, 9, ..."""
+        part = slice(light_terms), slice(view_terms)
+        return ShBtf(
+            maps=self.maps[part],
+            scale=self.scale[part],
+            offset=self.offset[part],
+            lights=self.lights,
+            views=self.views,
+        )
+
+    def evaluate(
+        self,
+        uv: Float[Tensor, "*batch 2"],
+        wi: Float[Tensor, "*batch 3"],
+        wo: Float[Tensor, "*batch 3"],
+        seen: Footprint | None = None,
+    ) -> Float[Tensor, "*batch 3"]:
+        """Return T(uv, wi, wo), linear RGB; 0 for wi below the horizon.
+
+        Args:
+            uv: (..., 2) texture coordinates, unbounded.
+            wi: (..., 3) unit direction to the light, local frame.
+            wo: (..., 3) unit direction to the viewer, local frame; held below the last ring.
+            seen: what is to be averaged over, of (n, 2) uv; None = the point.
+
+        Returns:
+            (..., 3); few coefficients can make it slightly negative, which is left to the caller.
+        """
+        light = _held_basis(self.lights, wi, self.terms[0])
+        return self._summed(uv, light, wo, seen) * horizon_falloff(self.lights, wi)
+
+    def ambient(
+        self, uv: Float[Tensor, "*batch 2"], wo: Float[Tensor, "*batch 3"], seen: Footprint | None = None
+    ) -> Float[Tensor, "*batch 3"]:
+        """Return L_a(uv, wo) = (1/pi) times the integral of T over the light hemisphere (white: 1)."""
+        light = self.everywhere.to(wo.dtype).expand(*wo.shape[:-1], -1)
+        return self._summed(uv, light, wo, seen, most=1)
+
+    def decoded(self) -> Float[Tensor, "k_l k_v H W 3"]:
+        """Return the coefficients C as floating-point values."""
+        codes = self.maps.to(self.scale.dtype)
+        return self.offset[:, :, None, None] + self.scale[:, :, None, None] * codes
+
+    def _summed(
+        self, uv: Tensor, light: Tensor, wo: Tensor, seen: Footprint | None, most: int = pyramid.MOST_PROBES
+    ) -> Tensor:
+        """Return the sum over coefficients, given the basis of the light."""
+        view = _held_basis(self.views, wo, self.terms[1])
+        weight = (light.unsqueeze(-1) * view.unsqueeze(-2)).flatten(-2).reshape(-1, math.prod(self.terms))
+        scale, offset = (x.to(uv.dtype).flatten(0, 1) for x in (self.scale, self.offset))
+
+        def look_up(which: Tensor, uv: Tensor, level: int) -> Tensor:
+            taps = address.bilinear(uv, *self.levels[level].shape[2:4])
+            found = [
+                torch.einsum("ptkc,pt,pk,kc->pc", self._texels[level][texel].to(uv.dtype), share, w, scale)
+                for texel, share, w in zip(
+                    taps.texel.split(POINTS), taps.weight.split(POINTS), weight[which].split(POINTS), strict=True
+                )
+            ]
+            return torch.cat(found) if found else uv.new_zeros(0, 3)
+
+        texels = max(self.texels), len(self.levels)
+        summed = pyramid.average(look_up, uv, seen, *texels, most=most)
+        return summed + (weight @ offset).reshape(summed.shape)
+
+    @cached_property
+    def levels(self) -> list[Shaped[Tensor, "k_l k_v _ _ 3"]]:
+        """The maps, and their means over ever more texels."""
+        return pyramid.build(self.maps, 2)
+
+    @cached_property
+    def _texels(self) -> list[Tensor]:
+        """(texel, k_l k_v, 3) codes of each level: all that a texel needs in one place."""
+        return [x.flatten(0, 1).flatten(1, 2).movedim(0, 1).contiguous() for x in self.levels]
+
+    @cached_property
+    def everywhere(self) -> Float[Tensor, "k_l"]:
+        """Each harmonic of the light, held and falling off as in `evaluate`, over the hemisphere and pi."""
+        w, weight = _hemisphere_points(self.lights.last, degree_of(self.terms[0]))
+        values = _held_basis(self.lights, w, self.terms[0]) * horizon_falloff(self.lights, w)
+        return (weight / math.pi) @ values
+
+
+def _held_basis(directions: DirectionSet, w: Tensor, terms: int) -> Tensor:
+    """Return the basis at w, below the last ring at that ring's direction of the same azimuth."""
+    theta, phi = to_angles(w)
+    inside = (theta <= directions.last).unsqueeze(-1)
+    return basis(torch.where(inside, w, from_angles(theta.clamp(max=directions.last), phi)), degree_of(terms))
+
+
+def _hemisphere_points(last: float, degree: int) -> tuple[Tensor, Tensor]:
+    """Return points and solid angles over the hemisphere, exact for harmonics within `last` and close beyond it."""
+    import numpy as np
+
+    nodes, weights = (torch.from_numpy(x) for x in np.polynomial.legendre.leggauss(degree + 4))
+    z, dz = [], []
+    for low, high in ((0.0, math.cos(last)), (math.cos(last), 1.0)):
+        z.append(low + (nodes + 1) * ((high - low) / 2))
+        dz.append(weights * ((high - low) / 2))
+    steps = 2 * degree + 1
+    phi = torch.arange(steps, dtype=torch.float64) * (2 * math.pi / steps)
+    theta = torch.cat(z).clamp(-1, 1).acos()
+    w = from_angles(*torch.broadcast_tensors(theta[:, None], phi))
+    weight = (torch.cat(dz) * (2 * math.pi / steps))[:, None].expand(-1, steps)
+    return w.reshape(-1, 3), weight.reshape(-1)
+
+
+def bands(terms: int) -> list[slice]:
+    """Return the coefficients of each band l = 0, 1, ...: 2 l + 1 of them."""
+    return [slice(l * l, (l + 1) ** 2) for l in range(degree_of(terms) + 1)]
+
+
+def save(model: ShBtf, path: str | Path, *, silhouette: Mdf | None = None, **meta: object) -> None:
+    """Write a run-time model (.meso): one tensor per band of light and view, and the material's MDF if it has one."""
+    tensors = {
+        f"sh.map.{a}.{b}": model.maps[light, view]
+        for a, light in enumerate(bands(model.terms[0]))
+        for b, view in enumerate(bands(model.terms[1]))
+    }
+    tensors |= {"sh.scale": model.scale, "sh.offset": model.offset}
+    about: dict[str, object] = {
+        "lights": model.lights.name, "views": model.views.name, "terms": list(model.terms), "domain": "hemisphere_fit",
+    }  # fmt: skip
+    parts: dict[str, object] = {"kind": "sh", "sh": about, **meta}
+    if silhouette is not None:
+        mdf_tensors, parts["mdf"] = mdf.to_tensors(silhouette)
+        tensors |= mdf_tensors
+    store.write_model(path, tensors, parts)
+
+
+def load(path: str | Path, *, degree: int | None = None) -> ShBtf:
+    """Return the double-SH BTF of a run-time model, reading only bands up to `degree` where that is given.
+
+    Raises:
+        FormatError: the file is missing, damaged, or holds no double-SH BTF.
+    """
+    model = store.Model(path)
+    about = model.meta.get("sh")
+    if about is None:
+        raise FormatError(f"{path}: expected a double-SH BTF, found {', '.join(model.names()) or 'nothing'}")
+    with store.reading(path):
+        kept = [n if degree is None else min(n, (degree + 1) ** 2) for n in about["terms"]]
+        rows = [
+            torch.cat([model.read(f"sh.map.{a}.{b}") for b in range(len(bands(kept[1])))], 1)
+            for a in range(len(bands(kept[0])))
+        ]
+        return ShBtf(
+            maps=torch.cat(rows),
+            scale=model.read("sh.scale")[: kept[0], : kept[1]],
+            offset=model.read("sh.offset")[: kept[0], : kept[1]],
+            lights=hemisphere.parse(about["lights"]),
+            views=hemisphere.parse(about["views"]),
+        )
