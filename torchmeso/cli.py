@@ -19,7 +19,7 @@ from typing import Any
 import click
 
 from torchmeso.backends.allocator import keep_freed_memory
-from torchmeso.errors import ConfigError, MesoError
+from torchmeso.errors import ConfigError, MesoError, StorageError
 
 MESOS = "sheet, groove, spheres, brick, blocks, grid, weave, pipes, chain, grass, squama, peanut, bark"
 """The built-in mesostructures, said here so that help does not wait for torch."""
@@ -36,6 +36,8 @@ class _Group(click.Group):
         except MesoError as error:
             if ctx.params.get("debug"):
                 raise
+            if isinstance(error, StorageError):  # Zarr's other writes fail for the same reason
+                logging.getLogger("asyncio").setLevel(logging.CRITICAL)
             click.echo(f"{ctx.info_name} {ctx.invoked_subcommand}: error: {error}", err=True)
             ctx.exit(2)
         except KeyboardInterrupt:
