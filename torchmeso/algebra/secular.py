@@ -105,7 +105,7 @@ def solve(
         multiplier = torch.zeros_like(w[..., 0])
     else:
         multiplier = _multiplier(w, s2, energy.to(dtype).expand(w.shape[:-1]))
-    c = torch.nan_to_num(w / (s2 + multiplier.unsqueeze(-1))) @ factors.right.to(dtype).mT
+    c = (w / (s2 + multiplier.unsqueeze(-1))) @ factors.right.to(dtype).mT
     return Solution(c, multiplier)
 
 

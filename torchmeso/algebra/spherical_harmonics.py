@@ -127,12 +127,12 @@ def _rows(w: Float[Tensor, "k 3"], degree: int) -> list[Float[Tensor, "k"]]:
         if m:
             cosine, sine = x * cosine - y * sine, x * sine + y * cosine
         before, last = None, torch.full_like(z, _sectoral(m))
-        for degree_l in range(m, degree + 1):
-            if degree_l > m:
-                a, b = _step(degree_l, m)
+        for l in range(m, degree + 1):
+            if l > m:
+                a, b = _step(l, m)
                 now = a * z * last if before is None else torch.addcmul(before * (-a * b), z, last, value=a)
                 before, last = last, now
-            centre = degree_l * degree_l + degree_l
+            centre = l * l + l
             rows[centre + m] = last * cosine
             if m:
                 rows[centre - m] = last * sine
