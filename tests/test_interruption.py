@@ -50,7 +50,7 @@ def finish(place, *arguments, **options) -> tuple[int, str]:
 
 
 def wait_for(condition) -> None:
-    for _ in range(2000):
+    for _ in range(6000):
         if condition():
             return
         time.sleep(0.02)
@@ -145,7 +145,7 @@ def test_a_sequence_that_was_killed_goes_on(place):
     command = ("render", "small.yaml", "--frames", 2000, "--out", "a.png")
     process = start(place, *command)
     part = place / "a.png.part"
-    wait_for(lambda: len(list(part.glob("a_*.png"))) >= 3)
+    wait_for(lambda: len(list(part.glob("a_????.png"))) >= 3)
     process.kill()
     process.communicate(timeout=60)
     assert left(place, "warm.png") == []
