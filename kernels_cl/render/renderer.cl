@@ -1,8 +1,8 @@
 // A frame: tiles of the camera's picture are filled, tested and shaded while they lie in the cache.
 // Host: torchmeso/render/renderer.py
 //
-// Compiled with SILHOUETTE and MIXED (see silhouette.clh), ONE_LAYER, SHADOWS where lights have maps, and HARMONICS where
-// there are double-SH BTFs.
+// Compiled with SILHOUETTE and MIXED (see silhouette.clh), ONE_LAYER, SHADOWS where lights have maps, FILTERED where
+// pixels average what they cover, and HARMONICS where there are double-SH BTFs.
 
 #include "data/sh_btf.clh"
 #include "data/textured.clh"
@@ -13,7 +13,7 @@ typedef struct {
     int lights, ambient_paper, depths, outputs;  // outputs: OWNER also writes depth, objects and shadows
     int capacity, skips, stride, pitch;  // pitch: pixels of a row of the picture
     float ambient, background[3], rank_error;
-    float pixel;  // world width of what a pixel averages, at view depth 1 in perspective; 0 = nothing is averaged
+    float pixel;  // FILTERED: world width of what a pixel averages, at view depth 1 in perspective
     int pad[2];
 } Frame;
 #define OWNER 1
@@ -103,26 +103,25 @@ static void shade_object(const Place *place, __global const Reflectance *reflect
     Weights first;
     Vector3 normal;
     float4 T[16], albedo[16];
-    const int filtered = frame->pixel > 0.0f;
     float16 pixel = frame->pixel / seen->at.scale;
-    if (filtered && place->view->perspective) {
+    if (place->view->perspective) {
         const Vector3 from_eye = {seen->position.x - rays->origin.x, seen->position.y - rays->origin.y,
                                   seen->position.z - rays->origin.z};
         const float16 depth = dot3(from_eye, rays->direction) / rays->stretch;
         pixel *= MAX(depth, (float16)0.0f);
     }
     if (DIFFUSE) {
-        normal = diffuse_at(tables, reflectance, seen->at.u, seen->at.v, wo, filtered, pixel, bits, albedo);
+        normal = diffuse_at(tables, reflectance, seen->at.u, seen->at.v, wo, pixel, bits, albedo);
 #ifdef HARMONICS
     } else if (harmonic) {
         look_around(TABLE(Level, tables, reflectance->levels), reflectance->level_count, seen->at.u, seen->at.v, wo,
-                    filtered, pixel, MOST_PROBES, bits, &area);
+                    pixel, MOST_PROBES, bits, &area);
         contract(tables, reflectance, wo, &area, bits, &contracted);
 #endif
     } else {
         view = footprint(TABLE(Ring, tables, reflectance->view_rings), reflectance->view_count, wo);
         look_around(TABLE(Level, tables, reflectance->levels), reflectance->level_count, seen->at.u, seen->at.v, wo,
-                    filtered, pixel, MOST_PROBES, bits, &area);
+                    pixel, MOST_PROBES, bits, &area);
         first = view_weights(tables, reflectance, 0, &view, bits);
     }
     int lit = 0;
@@ -178,7 +177,7 @@ static void shade_object(const Place *place, __global const Reflectance *reflect
     const int several = area.count > 1;
     if (several)
         look_around(TABLE(Level, tables, reflectance->levels), reflectance->level_count, seen->at.u, seen->at.v, wo,
-                    filtered, pixel, 1, bits, &area);
+                    pixel, 1, bits, &area);
 #ifdef HARMONICS
     if (harmonic) {
         if (several) contract(tables, reflectance, wo, &area, dark, &contracted);

@@ -309,7 +309,7 @@ class Renderer:
         frame["depths"], frame["outputs"] = outputs == DETAILS or maps is not None, outputs
         frame["capacity"], frame["stride"] = self._taken + self._extra, picture.views.stride
         frame["skips"], frame["rank_error"] = self._skip_bits(), self.options.rank_error
-        frame["pixel"] = camera.pixel_size / self.options.antialias if self.options.filtering else 0.0
+        frame["pixel"] = camera.pixel_size / self.options.antialias
         frame["pitch"] = picture.rgba.shape[1]
         frame["ambient"], frame["background"] = scene.ambient, scene.background
         picture.frame.send()
@@ -354,7 +354,7 @@ class Renderer:
              picture.lights.buffer, lights.views, lights.slots, lights.labels, lights.counters, *stored,
              picture.frame.buffer, *self._layers(),
              *(b for b, _ in picture.results), picture.empty.buffer),
-            (*self._defines, *(["-DSHADOWS"] * self.options.shadows)),
+            (*self._defines, *(["-DSHADOWS"] * self.options.shadows), *(["-DFILTERED"] * self.options.filtering)),
         )  # fmt: skip
 
 
