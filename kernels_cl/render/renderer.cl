@@ -2,9 +2,9 @@
 // Host: torchmeso/render/renderer.py
 //
 // Compiled with SILHOUETTE and MIXED (see silhouette.clh), ONE_LAYER, SHADOWS where lights have maps, FILTERED where
-// pixels average what they cover, and HARMONICS where there are double-SH BTFs.
+// pixels average what they cover, and HARMONICS where there are double-SH or SH + PCA BTFs.
 
-#include "data/sh_btf.clh"
+#include "data/sh_pca_btf.clh"
 #include "data/textured.clh"
 #include "render/shadow_map.clh"
 
@@ -95,7 +95,8 @@ static void shade_object(const Place *place, __global const Reflectance *reflect
     const Vector3 wo = to_local(&seen->at, towards);
     const int eigen = reflectance->there == EIGEN;
 #ifdef HARMONICS
-    const int harmonic = reflectance->there == HARMONIC;
+    const int components = reflectance->there == HARMONIC_PCA;
+    const int harmonic = components || reflectance->there == HARMONIC;
     Contracted contracted;
 #endif
     Footprint view;
@@ -116,7 +117,8 @@ static void shade_object(const Place *place, __global const Reflectance *reflect
     } else if (harmonic) {
         look_around(TABLE(Level, tables, reflectance->levels), reflectance->level_count, seen->at.u, seen->at.v, wo,
                     pixel, MOST_PROBES, bits, &area);
-        contract(tables, reflectance, wo, &area, bits, &contracted);
+        if (components) contract_components(tables, reflectance, wo, &area, bits, &contracted);
+        else contract(tables, reflectance, wo, &area, bits, &contracted);
 #endif
     } else {
         view = footprint(TABLE(Ring, tables, reflectance->view_rings), reflectance->view_count, wo);
@@ -180,7 +182,8 @@ static void shade_object(const Place *place, __global const Reflectance *reflect
                     pixel, 1, bits, &area);
 #ifdef HARMONICS
     if (harmonic) {
-        if (several) contract(tables, reflectance, wo, &area, dark, &contracted);
+        if (several && components) contract_components(tables, reflectance, wo, &area, dark, &contracted);
+        if (several && !components) contract(tables, reflectance, wo, &area, dark, &contracted);
         ambient_harmonics(tables, reflectance, &contracted, dark, T);
     } else
 #endif

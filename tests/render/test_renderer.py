@@ -5,9 +5,10 @@ import torch
 
 from tests.render.scenes import camera, sun
 from torchmeso.backends import opencl
-from torchmeso.compress import double_sh, eigen
+from torchmeso.compress import double_sh, eigen, sh_pca
 from torchmeso.compress.double_sh import DoubleShOptions
 from torchmeso.compress.eigen import EigenOptions
+from torchmeso.compress.sh_pca import ShPcaOptions
 from torchmeso.data.sh_btf import ShBtf
 from torchmeso.data.textured import Textured
 from torchmeso.errors import BackendError
@@ -474,6 +475,29 @@ def test_spherical_harmonics(storage, rule, brick, device):
         Object(mesh=shapes.torus(tiles=(6, 2), triangles=600), material=smooth),
         Object(mesh=moved(shapes.plane(size=(6.0, 6.0), tiles=(9, 9)), y=-0.6), material=smooth),
         Object(mesh=moved(shapes.sphere(radius=0.4, triangles=300), y=0.6), material=brick),
+    )
+    scene = Scene(objects=objects, lights=LIGHTS["spot"], ambient=0.3, ambient_rule=rule)
+    exact, fast, wrong = compare(scene, camera((1.5, 2.0, 3.5), size=96), FrameOptions(shadow_map_size=128))
+    assert wrong <= 4
+    alike = (exact.owner == fast.owner) & (exact.shadowed == fast.shadowed).all(0)
+    assert (exact.rgb - fast.rgb)[alike].abs().quantile(0.99) < 3e-4
+
+
+@pytest.mark.parametrize(("storage", "rank", "views"), [("uint8", 11, "grid(6, 3, 80)"), ("float32", 3, "ubo81")])
+@pytest.mark.parametrize("rule", ["add", "paper"])
+def test_components_of_spherical_harmonics(storage, rank, views, rule, brick, device):
+    """An SH + PCA BTF beside a double-SH and an eigen BTF, near and small in the picture: the same picture as torch."""
+    table = bake_btf.in_memory(
+        generators.brick(), BtfOptions(texels=16, lights="grid(8, 4, 80)", views=views, samples=1, bounces=0)
+    )
+    few = ShPcaOptions(rank=rank, light_terms=9, storage=storage)
+    blended = Material(btf=sh_pca.fit(table, few), mdf=brick.mdf)
+    smooth = Material(btf=double_sh.fit(table, DoubleShOptions(light_terms=9, view_terms=9)))
+    objects = (
+        Object(mesh=shapes.torus(tiles=(6, 2), triangles=600), material=blended),
+        Object(mesh=moved(shapes.plane(size=(6.0, 6.0), tiles=(9, 9)), y=-0.6), material=blended),
+        Object(mesh=moved(shapes.sphere(radius=0.4, triangles=300), y=0.6), material=brick),
+        Object(mesh=moved(shapes.sphere(radius=0.2, triangles=300), y=1.2), material=smooth),
     )
     scene = Scene(objects=objects, lights=LIGHTS["spot"], ambient=0.3, ambient_rule=rule)
     exact, fast, wrong = compare(scene, camera((1.5, 2.0, 3.5), size=96), FrameOptions(shadow_map_size=128))

@@ -1,4 +1,4 @@
-"""Storage of eigen maps: uint8 codes with a scale and an offset per component and channel, or floats.
+"""Storage of maps: uint8 codes with a scale and an offset per component and channel, or floats.
 
 Test: tests/compress/test_quantize.py
 """
@@ -20,17 +20,17 @@ class Codes(NamedTuple):
     """Quantised values: value = offset + scale * code.
 
     Attributes:
-        codes: (..., rank, 3) in the storage type.
-        scale: (rank, 3) float32.
-        offset: (rank, 3) float32.
+        codes: (..., rank, channel) in the storage type; channels are rgb, or one for all of them.
+        scale: (rank, channel) float32.
+        offset: (rank, channel) float32.
     """
 
-    codes: Shaped[Tensor, "*batch rank 3"]
-    scale: Float[Tensor, "rank 3"]
-    offset: Float[Tensor, "rank 3"]
+    codes: Shaped[Tensor, "*batch rank channel"]
+    scale: Float[Tensor, "rank channel"]
+    offset: Float[Tensor, "rank channel"]
 
 
-def quantize(values: Float[Tensor, "*batch rank 3"], storage: Storage) -> Codes:
+def quantize(values: Float[Tensor, "*batch rank channel"], storage: Storage) -> Codes:
     """Return `values` in `storage`; uint8 spreads its 256 codes over the range of each component and channel.
 
     float16 keeps eleven bits relative to the largest value, so that maps of any range fit.

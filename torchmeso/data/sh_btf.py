@@ -107,7 +107,7 @@ class ShBtf:
         Returns:
             (..., 3); few coefficients can make it slightly negative, which is left to the caller.
         """
-        light = _held_basis(self.lights, wi, self.terms[0])
+        light = held_basis(self.lights, wi, self.terms[0])
         return self._summed(uv, light, wo, seen) * horizon_falloff(self.lights, wi)
 
     def ambient(
@@ -126,7 +126,7 @@ class ShBtf:
         self, uv: Tensor, light: Tensor, wo: Tensor, seen: Footprint | None, most: int = pyramid.MOST_PROBES
     ) -> Tensor:
         """Return the sum over coefficients, given the basis of the light."""
-        view = _held_basis(self.views, wo, self.terms[1])
+        view = held_basis(self.views, wo, self.terms[1])
         weight = (light.unsqueeze(-1) * view.unsqueeze(-2)).flatten(-2).reshape(-1, math.prod(self.terms))
         scale, offset = (x.to(uv.dtype).flatten(0, 1) for x in (self.scale, self.offset))
 
@@ -157,16 +157,20 @@ class ShBtf:
     @cached_property
     def everywhere(self) -> Float[Tensor, "k_l"]:
         """Each harmonic of the light, held and falling off as in `evaluate`, over the hemisphere and pi."""
-        w, weight = _hemisphere_points(self.lights.last, degree_of(self.terms[0]))
-        values = _held_basis(self.lights, w, self.terms[0]) * horizon_falloff(self.lights, w)
-        return (weight / math.pi) @ values
+        return basis_everywhere(self.lights, self.terms[0])
 
 
-def _held_basis(directions: DirectionSet, w: Tensor, terms: int) -> Tensor:
+def held_basis(directions: DirectionSet, w: Float[Tensor, "*batch 3"], terms: int) -> Float[Tensor, "*batch n"]:
     """Return the basis at w, below the last ring at that ring's direction of the same azimuth."""
     theta, phi = to_angles(w)
     inside = (theta <= directions.last).unsqueeze(-1)
     return basis(torch.where(inside, w, from_angles(theta.clamp(max=directions.last), phi)), degree_of(terms))
+
+
+def basis_everywhere(lights: DirectionSet, terms: int) -> Float[Tensor, "n"]:
+    """Return each harmonic of the light, held and falling off below the last ring, over the hemisphere and pi."""
+    w, weight = _hemisphere_points(lights.last, degree_of(terms))
+    return (weight / math.pi) @ (held_basis(lights, w, terms) * horizon_falloff(lights, w))
 
 
 def _hemisphere_points(last: float, degree: int) -> tuple[Tensor, Tensor]:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, Int32, UInt8, UInt16
+from jaxtyping import Bool, Float, Float32, Int, Int32, UInt8, UInt16
 from torch import Tensor
 
 from torchmeso.algebra import spherical_harmonics
@@ -21,14 +21,21 @@ from torchmeso.data.eigen_btf import EigenBtf
 from torchmeso.data.mdf import Mdf
 from torchmeso.data.relief import CODES as RELIEF_CODES
 from torchmeso.data.sh_btf import ShBtf
+from torchmeso.data.sh_pca_btf import ShPcaBtf
 from torchmeso.data.textured import Textured
 from torchmeso.errors import BackendError
-from torchmeso.geometry import hemisphere
+from torchmeso.geometry import hemisphere, triangulation
 from torchmeso.geometry.hemisphere import DirectionSet
 from torchmeso.render.scene import Material
 
 BLOCK, GROUP, MOST_TERMS = 64, 4, 64
 """Bytes that tables are aligned to, components that stand in one vector, and the most harmonics of light or view."""
+
+PCA_GROUP = 8
+"""Components of an SH + PCA BTF that stand in one vector."""
+
+Reflecting = EigenBtf | ShBtf | ShPcaBtf | Textured
+"""What kernels read."""
 
 REFLECTANCE = np.dtype(
     [(name, "i4") for name in ("there", "height", "width", "groups", "codes", "light_rings", "light_count")]
@@ -37,9 +44,9 @@ REFLECTANCE = np.dtype(
     + [("last_cosine", "f4"), ("albedo", "f4", 3)]
     + [(name, "i4") for name in ("normals", "normal_levels", "normal_level_count")]
     + [(name, "i4") for name in ("light_steps", "light_degree", "view_steps", "view_degree")]
-    + [("view_last_cosine", "f4"), ("pad", "i4", 2)]
+    + [("view_last_cosine", "f4"), ("view_edges", "i4"), ("pad", "i4")]
 )
-EIGEN, TEXTURED, HARMONIC = 1, 2, 3
+EIGEN, TEXTURED, HARMONIC, HARMONIC_PCA = 1, 2, 3, 4
 """What stands in a reflectance's `there`; 0 = a plain colour."""
 
 MDF = np.dtype(
@@ -64,6 +71,7 @@ ADDRESSES = {
         "normal_levels",
         "light_steps",
         "view_steps",
+        "view_edges",
     ),
     MDF: ("rings", "delta", "missing", "relief", "plateau", "hole"),
 }
@@ -78,7 +86,7 @@ class DeviceMaterials(NamedTuple):
         mdfs: (surface,) see `MDF`.
         reflectances: (surface,) see `REFLECTANCE`.
         textured: whether any surface has a mesostructure.
-        harmonic: whether any surface has a double-SH BTF.
+        harmonic: whether any surface has a double-SH or SH + PCA BTF.
         parts: the BTFs and MDFs in `tables`, by identity.
         packed: how many of them were uploaded, not taken over.
     """
@@ -115,7 +123,7 @@ def upload_materials(
     Raises:
         BackendError: there is no device, or a material is of a kind that kernels do not read.
     """
-    wanted: dict[tuple[int, bool], EigenBtf | ShBtf | Textured | Mdf] = {}
+    wanted: dict[tuple[int, bool], Reflecting | Mdf] = {}
     for m in materials:
         if m.btf is not None:
             wanted[id(m.btf), ambient] = _readable(m.btf)
@@ -136,7 +144,7 @@ def upload_materials(
         if m.mdf is not None and silhouettes:
             mdfs[i] = _placed(parts[id(m.mdf), False])
     textured = bool(mdfs["there"].any())
-    harmonic = bool((reflectances["there"] == HARMONIC).any())
+    harmonic = bool(np.isin(reflectances["there"], (HARMONIC, HARMONIC_PCA)).any())
     return DeviceMaterials(
         tables, opencl.upload(mdfs), opencl.upload(reflectances), textured, harmonic, parts, len(new)
     )
@@ -144,7 +152,7 @@ def upload_materials(
 
 def _join(
     kept: "dict[tuple[int, bool], _Part]",
-    new: "dict[tuple[int, bool], EigenBtf | ShBtf | Textured | Mdf]",
+    new: "dict[tuple[int, bool], Reflecting | Mdf]",
     before: DeviceMaterials | None,
 ) -> "tuple[opencl.Buffer, dict[tuple[int, bool], _Part]]":
     """Return a buffer with the parts that are `kept`, copied on the device, and behind them the `new` ones."""
@@ -160,6 +168,8 @@ def _join(
             record = _reflectance(pool, source, ambient=key[1])
         elif isinstance(source, ShBtf):
             record = _harmonics(pool, source)
+        elif isinstance(source, ShPcaBtf):
+            record = _harmonic_components(pool, source)
         else:
             record = _pictures(pool, source) if isinstance(source, Textured) else _mdf(pool, source)
         arrays.append(pool.joined())
@@ -183,15 +193,19 @@ def _placed(part: _Part) -> np.void:
     return record[0]
 
 
-def _readable(btf: object) -> EigenBtf | ShBtf | Textured:
-    if not isinstance(btf, EigenBtf | ShBtf | Textured):
+def _readable(btf: object) -> Reflecting:
+    if not isinstance(btf, Reflecting):
         raise BackendError(
-            f"opencl: expected an eigen or double-SH BTF, got {type(btf).__name__}; use the torch backend"
+            f"opencl: expected an eigen, double-SH or SH + PCA BTF, got {type(btf).__name__}; use the torch backend"
         )
-    if isinstance(btf, ShBtf) and max(btf.terms) > MOST_TERMS:
+    most = max(btf.terms) if isinstance(btf, ShBtf) else btf.terms if isinstance(btf, ShPcaBtf) else 0
+    if most > MOST_TERMS:
         raise BackendError(
-            f"opencl: expected at most {MOST_TERMS} coefficients of light or view, got {max(btf.terms)}; "
-            "use the torch backend"
+            f"opencl: expected at most {MOST_TERMS} coefficients of light or view, got {most}; use the torch backend"
+        )
+    if isinstance(btf, ShPcaBtf) and btf.rank > 3 * MOST_TERMS:
+        raise BackendError(
+            f"opencl: expected at most {3 * MOST_TERMS} components, got {btf.rank}; use the torch backend"
         )
     return btf
 
@@ -255,6 +269,45 @@ def _harmonics(pool: "_Pool", btf: ShBtf) -> np.ndarray:
         record[f"{side}_degree"] = degree
     record["last_cosine"], record["view_last_cosine"] = math.cos(btf.lights.last), math.cos(btf.views.last)
     return record
+
+
+def _harmonic_components(pool: "_Pool", btf: ShPcaBtf) -> np.ndarray:
+    record = np.zeros(1, REFLECTANCE)
+    codes = btf.maps.dtype == torch.uint8
+    more = -btf.rank % PCA_GROUP
+    levels = [hemisphere.with_pole(x if codes else x.float(), btf.views).flatten(0, 2) for x in btf.levels]
+    rows = [len(x) for x in levels]
+    first = np.cumsum([0, *rows[:-1]]) * ((btf.rank + more) // PCA_GROUP)
+    records = np.stack([first, 0 * first, *np.array([x.shape[1:3] for x in btf.levels]).T], 1).astype(np.int32)
+    scaled = btf.basis.double() * btf.scale.double()[:, None, None]
+    rest = torch.einsum("k,kmc->mc", btf.offset.double(), btf.basis.double())
+
+    def in_fours(x: Tensor) -> np.ndarray:
+        """Return (..., k_l, 3) as (..., four, 16): four coefficients of rgb and nothing, float32."""
+        padded = torch.nn.functional.pad(x, (0, 1, 0, -btf.terms % GROUP))
+        return padded.unflatten(-2, (-1, GROUP)).flatten(-2).float().numpy()
+
+    record["there"], record["height"], record["width"] = HARMONIC_PCA, *btf.texels
+    record["groups"], record["codes"] = (btf.rank + more) // PCA_GROUP, codes
+    record["maps"] = pool.add(torch.nn.functional.pad(torch.cat(levels), (0, more)).numpy())
+    record["levels"], record["level_count"] = pool.add(records), len(levels)
+    record["weights"] = pool.add(in_fours(torch.nn.functional.pad(scaled, (0, 0, 0, 0, 0, more))))
+    record["offset"] = pool.add(in_fours(rest))
+    strips, edges = _triangles(btf.views)
+    record["view_rings"], record["view_count"], record["view_edges"] = pool.add(strips), len(strips), pool.add(edges)
+    record["ambient"] = pool.add(btf.everywhere.float().numpy())
+    degree = spherical_harmonics.degree_of(btf.terms)
+    record["light_steps"], record["light_degree"] = pool.add(spherical_harmonics.recurrence(degree)), degree
+    record["last_cosine"] = math.cos(btf.lights.last)
+    return record
+
+
+def _triangles(directions: DirectionSet) -> tuple[Float32[np.ndarray, "strip 4"], Float32[np.ndarray, "edge 4"]]:
+    """Return the strips between rings, and their cross edges."""
+    table = triangulation.strips(directions)
+    room = torch.full_like(table.count, table.phi.shape[1])
+    strips = torch.stack([table.theta[:-1], table.theta.diff(), table.count, room], -1)
+    return strips.float().numpy(), torch.cat([table.phi, table.node], -1).flatten(0, 1).float().numpy()
 
 
 def _as_codes(x: Float[Tensor, "n rank 3"], *, codes: bool) -> tuple[Tensor, Tensor, Tensor]:

@@ -1,0 +1,193 @@
+"""Fit an SH + PCA BTF: spherical harmonics over the light, then principal components over views and texels.
+
+kawasaki2005quilting, section 2. The samples f over the lights of every view, texel and channel become a vector
+z = P f, the vectors of the three channels become one, and the principal components v_k of all of these (not centred:
+eq. (1) adds no mean) give weights W_k = v_k . z and the basis b_k = Q v_k. Two ways over the light:
+
+- `sphere_projection` (the paper's): samples are interpolated over the triangles between the lights onto the texels of
+  a cube map, fall off below the last ring, are zero below the horizon, and are summed with y_m and solid angles; Q = 1.
+- `hemisphere_fit` (default): least squares at the L lights with a ridge, |f - Y c|^2 + r |c|^2, r = ridge L / 4 pi.
+  With Y = U S V^T the vector is z = U^T f and Q = V S / (S^2 + r): what PCA leaves out, and what eight bits lose, is
+  then an error of T at the lights and not one of coefficients, whose lengths say little on a hemisphere (the condition
+  of Y^T Y is 8e6 for 25 coefficients on ubo81). The ridge is for what lies between the lights: 1e-4 costs 0.1 dB at
+  the lights of a brick and wins 0.1 dB (25 coefficients) and 3.9 dB (36) between them.
+
+The components come from the Gram matrix of all vectors, which is exact, or from a sample of them (`training`, the
+paper's). Rows of texels are computed one by one: bands of any height give the same bits.
+
+Test: tests/compress/test_sh_pca.py
+"""
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchmeso.algebra import secular
+from torchmeso.algebra.gram import right_basis
+from torchmeso.algebra.spherical_harmonics import basis, degree_of, project
+from torchmeso.compress.quantize import Storage, quantize
+from torchmeso.data.btf import Bands, horizon_falloff
+from torchmeso.data.sh_pca_btf import Domain, ShPcaBtf
+from torchmeso.errors import ConfigError, check_range
+from torchmeso.geometry import cube_map, hemisphere, triangulation
+from torchmeso.geometry.hemisphere import DirectionSet
+
+BAND_BYTES = 128 << 20
+"""Memory of one band of texel rows."""
+
+FACE = 64
+"""Texels along a face of the cube map: 25 coefficients of ubo81 lie within 1e-3 of those of a finer one."""
+
+Progress = Callable[[float], None]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ShPcaOptions:
+    """How to compress.
+
+    Attributes:
+        rank: components K kept, at most three per coefficient.
+        light_terms: coefficients over the light: 1, 4, 9, 16, 25 or 36.
+        domain: least squares at the lights, or the paper's projection on a cube map.
+        ridge: how much small coefficients count beside small errors, least squares only; 0 = not at all.
+        training: vectors that the components are found from, drawn at random; None = all of them.
+        storage: uint8, float16 or float32.
+        regularise: let lights that cannot tell the coefficients apart pass, with the smallest coefficients.
+    """
+
+    rank: int = 16
+    light_terms: int = 25
+    domain: Domain = "hemisphere_fit"
+    ridge: float = 1e-4
+    training: int | None = None
+    storage: Storage = "uint8"
+    regularise: bool = False
+
+    def __post_init__(self) -> None:
+        """Raise ConfigError for terms that are no whole bands, or a rank or sample that does not go with them."""
+        degree_of(self.light_terms)
+        if not 1 <= self.rank <= 3 * self.light_terms:
+            raise ConfigError(
+                f"compress.rank: expected 1 to {3 * self.light_terms} (three channels of {self.light_terms} "
+                f"coefficients), got {self.rank}"
+            )
+        check_range("compress.ridge", self.ridge, 0, 1e6)
+        if self.training is not None:
+            check_range("compress.training", self.training, self.rank, 1e9)
+
+
+class Projection(NamedTuple):
+    """What turns samples over the light into vectors, and components of these into coefficients.
+
+    Attributes:
+        vector: (n, light) P.
+        coefficient: (n, n) Q.
+    """
+
+    vector: Float[Tensor, "n light"]
+    coefficient: Float[Tensor, "n n"]
+
+
+def projection(lights: DirectionSet, options: ShPcaOptions) -> Projection:
+    """Return the way over the light, in float64.
+
+    Raises:
+        ConfigError: the lights cannot tell so many coefficients apart, where least squares are asked for.
+    """
+    degree = degree_of(options.light_terms)
+    if options.domain == "hemisphere_fit":
+        Y = basis(lights.directions(torch.float64), degree)
+        found = secular.factorise(Y, f"compress: light ({lights.name})", regularise=options.regularise)
+        square = torch.where(found.values > 0, found.values.square(), 1)
+        inverse = found.values / (square + options.ridge * len(lights) / (4 * math.pi))
+        return Projection(found.left.mT.contiguous(), found.right * inverse)
+    cube = cube_map.texels(FACE)
+    # Each light in turn is 1 and the others 0: the matrix of everything that is linear in them.
+    c = project(_onto_cube(lights, cube).mT, cube.directions, cube.solid_angle, degree)
+    return Projection(c.mT.contiguous(), torch.eye(options.light_terms, dtype=torch.float64))
+
+
+def _onto_cube(lights: DirectionSet, cube: cube_map.CubeMap) -> Float[Tensor, "texel light"]:
+    """Return the share of every light in the texels of a cube map; T falls off below the last ring and ends at 0."""
+    taps = triangulation.interpolate(lights, cube.directions)
+    nodes = hemisphere.with_pole(torch.eye(len(lights), dtype=torch.float64), lights)
+    falloff = horizon_falloff(lights, cube.directions)
+    return torch.einsum("tk,tkl->tl", taps.weight, nodes[taps.node]) * falloff
+
+
+def fit(
+    btf: Bands,
+    options: ShPcaOptions | None = None,
+    *,
+    rng: torch.Generator | None = None,
+    progress: Progress = lambda share: None,
+) -> ShPcaBtf:
+    """Return the SH + PCA BTF of `btf`.
+
+    Args:
+        btf: in memory or on disk.
+        options: components, coefficients, domain, training and storage.
+        rng: draws the vectors of `training`; the same ones every time where it is None.
+        progress: called with the share done, 0..1.
+
+    Raises:
+        ConfigError: the lights cannot tell so many coefficients apart.
+        ShapeError: a value of the BTF is not finite.
+    """
+    options = options or ShPcaOptions()
+    through = projection(btf.lights, options)
+    P = through.vector.float()
+    height, width = btf.texels
+    trained = _trained(btf, options, rng or torch.Generator().manual_seed(0))
+    n = 3 * options.light_terms
+    gram = torch.zeros(n, n, dtype=torch.float64)
+    for row, z in _vectors(btf, P, None if trained is None else set(trained)):
+        chosen = z if trained is None else z[trained[row]]
+        gram += (chosen.mT @ chosen).double()
+        progress(0.5 * (row + 1) / height)
+    components = right_basis((gram + gram.mT) / 2, options.rank).vectors
+    V = components.float()
+    W = torch.empty(len(btf.views), height, width, options.rank)
+    for row, z in _vectors(btf, P):
+        W[:, row] = (z @ V).unflatten(0, (-1, width))
+        progress(0.5 + 0.5 * (row + 1) / height)
+    b = torch.einsum("mn,nck->kmc", through.coefficient, components.unflatten(0, (-1, 3)))
+    codes = quantize(W.unsqueeze(-1), options.storage)
+    return ShPcaBtf(
+        maps=codes.codes.squeeze(-1), scale=codes.scale.squeeze(-1), offset=codes.offset.squeeze(-1), basis=b.float(),
+        lights=btf.lights, views=btf.views, domain=options.domain,
+    )  # fmt: skip
+
+
+def _trained(btf: Bands, options: ShPcaOptions, rng: torch.Generator) -> dict[int, Tensor] | None:
+    """Return the vectors to train on, (view, column) counted within each texel row that has some; None = all."""
+    height, width = btf.texels
+    each = len(btf.views) * width
+    if options.training is None or options.training >= height * each:
+        return None
+    places = torch.randperm(height * each, generator=rng)[: options.training].sort().values
+    rows = places // each
+    return {row: places[rows == row] % each for row in rows.unique().tolist()}
+
+
+def _vectors(
+    btf: Bands, P: Float[Tensor, "n light"], asked: set[int] | None = None
+) -> Iterator[tuple[int, Float[Tensor, "_ vector"]]]:
+    """Yield the vectors (view and column, coefficient and channel) of every texel row, or of those `asked` for."""
+    height, width = btf.texels
+    row_bytes = len(btf.lights) * len(btf.views) * width * 3 * 4
+    step = max(1, min(height, BAND_BYTES // row_bytes))
+    for start in range(0, height, step):
+        rows = [r for r in range(start, min(start + step, height)) if asked is None or r in asked]
+        if not rows:
+            continue
+        band = btf.rows(rows[0], rows[-1] + 1)
+        for row in rows:
+            samples = band[:, :, row - rows[0]].flatten(1)  # (light, view column channel)
+            z = (P @ samples).unflatten(1, (-1, 3)).movedim(0, 1)
+            yield row, z.flatten(1)
