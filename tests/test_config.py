@@ -131,6 +131,8 @@ REFUSED = [
     ),
     (minimal(objects=[{"mesh": "a.obj", "tile_size": 1, "unwrap": {"iteration": 1}}]), "did you mean 'iterations'"),
     (minimal(materials={"clay": {"meso": {"type": "brick"}, "normal_map": "n.png"}}), "'normal_map' belongs to"),
+    (minimal(materials={"clay": {"meso": {"type": "brick"}, "double_sh": {}, "sh_pca": {}}}), "at most one of 'double"),
+    (minimal(materials={"clay": {"meso": {"type": "brick"}, "sh_pca": {"rnak": 3}}}), "did you mean 'rank'"),
     (minimal(objects=[{"material": "clay"}]), "exactly one of 'shape' and 'mesh'"),
     (minimal(objects=[{"mesh": "a.obj", "material": "clay", "options": {"radius": 1}}]), "belong to built-in shapes"),
     (minimal(objects=[{"mesh": "a.obj", "material": "clay", "unwrap": True}]), "needs 'tile_size'"),

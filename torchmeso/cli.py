@@ -144,16 +144,29 @@ def _bake_one(meso: str, out: Any, force: bool, options: dict[str, Any]) -> None
 @main.command()
 @click.argument("table")
 @click.option(
-    "--method", default="eigen", type=click.Choice(["eigen", "double-sh"]), show_default=True, help="Kind of model."
+    "--method",
+    default="eigen",
+    type=click.Choice(["eigen", "double-sh", "sh-pca"]),
+    show_default=True,
+    help="Kind of model.",
 )
-@click.option("--rank", type=int, help="eigen: components kept, at most the number of views [4].")
-@click.option("--light-terms", type=int, help="double-sh: coefficients over the light: 1, 4, 9, 16, 25, 36 [25].")
+@click.option("--rank", type=int, help="eigen: components kept, at most the number of views [4]; sh-pca [16].")
+@click.option(
+    "--light-terms", type=int, help="double-sh, sh-pca: coefficients over the light: 1, 4, 9, 16, 25, 36 [25]."
+)
 @click.option("--view-terms", type=int, help="double-sh: coefficients over the view [25].")
 @click.option(
     "--energy", type=float, help="double-sh: bound of the coefficients' energy, of what the samples show [1]."
 )
 @click.option("--unbounded", is_flag=True, help="double-sh: plain least squares.")
-@click.option("--regularise", is_flag=True, help="double-sh: more coefficients than the directions tell apart.")
+@click.option("--regularise", is_flag=True, help="double-sh, sh-pca: more coefficients than the directions tell apart.")
+@click.option(
+    "--domain",
+    type=click.Choice(["hemisphere_fit", "sphere_projection"]),
+    help="sh-pca: least squares at the lights, or the projection of a cube map [hemisphere_fit].",
+)
+@click.option("--ridge", type=float, help="sh-pca: how much small coefficients count beside small errors [1e-4].")
+@click.option("--training", type=int, help="sh-pca: vectors to find the components from, drawn at random [all].")
 @click.option(
     "--storage", default="uint8", show_default=True, type=click.Choice(["uint8", "float16", "float32"]), help="Of maps."
 )
@@ -172,18 +185,19 @@ def compress(
     **options: Any,
 ) -> None:
     """Compress a BTF TABLE (.btf.zarr or .btf, or a folder or zip of pictures) into a run-time model."""
-    from torchmeso.compress import double_sh, eigen
-    from torchmeso.data import eigen_btf, mdf, sh_btf
+    from torchmeso.compress import double_sh, eigen, sh_pca
+    from torchmeso.data import eigen_btf, mdf, sh_btf, sh_pca_btf
     from torchmeso.pipeline import picture_sets
 
     if not out.endswith(".meso"):
         raise ConfigError(f"{out}: expected a name that ends in .meso")
     _refuse_to_replace(out, force)
     depth = None if silhouette is None else mdf.load(silhouette)
-    given = {name: value for name, value in options.items() if value not in (None, False)}
-    kind = eigen.EigenOptions if method == "eigen" else double_sh.DoubleShOptions
+    given = {name: value for name, value in options.items() if value is not None and value is not False}
+    kinds = {"eigen": eigen.EigenOptions, "double-sh": double_sh.DoubleShOptions, "sh-pca": sh_pca.ShPcaOptions}
+    kind = kinds[method]
     known = {field.name for field in fields(kind)}
-    if (wrong := sorted(set(given) - known)) or (unbounded and method == "eigen"):
+    if (wrong := sorted(set(given) - known)) or (unbounded and method != "double-sh"):
         raise ConfigError(f"compress: --method {method} has no --{(wrong or ['unbounded'])[0].replace('_', '-')}")
     if unbounded:
         given["energy"] = None
@@ -193,6 +207,8 @@ def compress(
         told = partial(report, f"{method} BTF")
         if isinstance(chosen, eigen.EigenOptions):
             eigen_btf.save(eigen.fit(source, chosen, progress=told), out, silhouette=depth)
+        elif isinstance(chosen, sh_pca.ShPcaOptions):
+            sh_pca_btf.save(sh_pca.fit(source, chosen, progress=told), out, silhouette=depth)
         else:
             sh_btf.save(double_sh.fit(source, chosen, backend="auto", progress=told), out, silhouette=depth)
     click.echo(out)

@@ -21,6 +21,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from torchmeso.backends import BackendChoice
 from torchmeso.compress.double_sh import DoubleShOptions
 from torchmeso.compress.eigen import EigenOptions
+from torchmeso.compress.sh_pca import ShPcaOptions
 from torchmeso.data import height_field
 from torchmeso.errors import ConfigError, FormatError, MesoError, did_you_mean
 from torchmeso.geometry.camera import Camera, look_at
@@ -135,7 +136,7 @@ class MesoConfig(BaseModel):
 class MaterialConfig(_Strict):
     """A mesostructure with how to bake and compress it; or a finished model; or a plain colour with pictures.
 
-    A BTF becomes an eigen BTF, or a double-SH BTF where `double_sh` is given.
+    A BTF becomes an eigen BTF, or a double-SH BTF where `double_sh` is given, or an SH + PCA BTF where `sh_pca` is.
     `rank` reads only that many components of a model; the others stay on disk. `albedo` multiplies `albedo_map`.
     """
 
@@ -150,6 +151,7 @@ class MaterialConfig(_Strict):
     mdf: MdfOptions = Field(default_factory=MdfOptions)
     eigen: EigenOptions = Field(default_factory=EigenOptions)
     double_sh: DoubleShOptions | None = None
+    sh_pca: ShPcaOptions | None = None
 
     @model_validator(mode="after")
     def _check(self) -> "MaterialConfig":
@@ -160,6 +162,8 @@ class MaterialConfig(_Strict):
             )
         if self.normal_map is not None and not plain:
             raise ValueError("'normal_map' belongs to an 'albedo' or 'albedo_map'")
+        if self.double_sh is not None and self.sh_pca is not None:
+            raise ValueError("expected at most one of 'double_sh' and 'sh_pca', the kind of model")
         if self.rank is not None and self.model is None:
             raise ValueError("'rank' belongs to a 'model'; a 'meso' has 'eigen: {rank: ...}'")
         return self
@@ -519,6 +523,7 @@ def _fields(kind: Any) -> dict[str, Any]:
         "mdf": MdfOptions,
         "eigen": EigenOptions,
         "double_sh": DoubleShOptions,
+        "sh_pca": ShPcaOptions,
         "lights": SpotConfig,
     }
     if inspect.isclass(kind) and issubclass(kind, BaseModel):

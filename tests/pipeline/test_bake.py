@@ -5,6 +5,7 @@ import torch
 
 from tests.pipeline.small import small
 from torchmeso.compress.double_sh import DoubleShOptions
+from torchmeso.compress.sh_pca import ShPcaOptions
 from torchmeso.data import store
 from torchmeso.errors import ConfigError, FormatError
 from torchmeso.pipeline import bake
@@ -53,6 +54,16 @@ def test_double_sh_instead_of_eigen(cache):
     assert found.btf.terms == (4, 4)
     assert found.mdf is not None
     assert bake.open_model(bake.model_path(brick), rank=1).btf.terms == (1, 1)
+
+
+def test_sh_pca_instead_of_eigen(cache):
+    few = ShPcaOptions(rank=3, light_terms=4)
+    brick = small().materials["brick"].model_copy(update={"sh_pca": few})
+    assert bake.model_path(brick) != bake.model_path(small().materials["brick"])
+    found = bake.prepare_material("brick", brick).material
+    assert (found.btf.rank, found.btf.terms) == (3, 4)
+    assert found.mdf is not None
+    assert bake.open_model(bake.model_path(brick), rank=2).btf.rank == 2
 
 
 def test_content_of_files_counts(tmp_path):

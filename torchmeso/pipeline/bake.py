@@ -13,9 +13,9 @@ from dataclasses import asdict, dataclass
 from functools import cache, partial
 from pathlib import Path
 
-from torchmeso.compress import double_sh, eigen
+from torchmeso.compress import double_sh, eigen, sh_pca
 from torchmeso.config import Config, MaterialConfig, MesoConfig
-from torchmeso.data import btf, eigen_btf, mdf, sh_btf, store, textured
+from torchmeso.data import btf, eigen_btf, mdf, sh_btf, sh_pca_btf, store, textured
 from torchmeso.errors import ConfigError, FormatError
 from torchmeso.geometry.mesh_file import Finish
 from torchmeso.meso import bake_btf, bake_mdf
@@ -89,6 +89,9 @@ def _compress(name: str, btf_table: Path, mdf_table: Path, material: MaterialCon
         told = partial(report, f"{name}: double-SH BTF")
         model = double_sh.fit(table, material.double_sh, backend="auto", progress=told)
         sh_btf.save(model, out, silhouette=depth)
+    elif material.sh_pca is not None:
+        told = partial(report, f"{name}: SH + PCA BTF")
+        sh_pca_btf.save(sh_pca.fit(table, material.sh_pca, progress=told), out, silhouette=depth)
     else:
         told = partial(report, f"{name}: eigen BTF")
         eigen_btf.save(eigen.fit(table, material.eigen, progress=told), out, silhouette=depth)
@@ -155,7 +158,8 @@ def open_model(path: str | Path, *, depth: bool = True, rank: int | None = None)
     Args:
         path: the model.
         depth: whether to read the MDF.
-        rank: components of the eigen BTF to read; all of them where it is None. Of a double-SH BTF the bands.
+        rank: components of the eigen or SH + PCA BTF to read; all of them where it is None. Of a double-SH BTF the
+            bands.
 
     Raises:
         FormatError: the file is missing, damaged, or holds no BTF.
@@ -163,6 +167,8 @@ def open_model(path: str | Path, *, depth: bool = True, rank: int | None = None)
     model = store.Model(path)
     if "sh" in model.meta:
         reflectance = sh_btf.load(path, degree=None if rank is None else rank - 1)
+    elif "sh_pca" in model.meta:
+        reflectance = sh_pca_btf.load(path, rank=rank)
     else:
         reflectance = eigen_btf.load(path, rank=rank)
     return Material(btf=reflectance, mdf=mdf.from_model(model) if depth else None)
@@ -176,7 +182,11 @@ def table_paths(material: MaterialConfig) -> tuple[Path, Path]:
 
 def model_path(material: MaterialConfig) -> Path:
     """Return where the cache keeps the run-time model of a material."""
-    kind = asdict(material.eigen) if material.double_sh is None else ["double-sh", asdict(material.double_sh)]
+    kind: object = asdict(material.eigen)
+    if material.double_sh is not None:
+        kind = ["double-sh", asdict(material.double_sh)]
+    if material.sh_pca is not None:
+        kind = ["sh-pca", asdict(material.sh_pca)]
     return store.cache_dir() / f"{store.content_hash(_keys(material), kind)}.meso"
 
 
