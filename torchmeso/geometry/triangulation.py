@@ -46,17 +46,17 @@ class Blend(NamedTuple):
 
 
 class Strips(NamedTuple):
-    """The triangles of a set; a strip holds `room` edges, a power of two, of which `count` + 1 are its own.
+    """The triangles of a set; a strip holds `room` edges, a power of two, of which `triangles` + 1 are its own.
 
     Attributes:
         theta: (strip + 1) radians, of the rings.
-        count: (strip) triangles; the last edge is the first one, a turn later.
+        triangles: (strip) how many; the last edge is the first one, a turn later.
         phi: (strip, room, 2) radians, growing: where edges leave the inner ring, and where they reach the outer one.
         node: (strip, room, 2) of the inner and of the outer ring.
     """
 
     theta: Float[Tensor, "_"]
-    count: Int[Tensor, "strip"]
+    triangles: Int[Tensor, "strip"]
     phi: Float[Tensor, "strip room 2"]
     node: Int[Tensor, "strip room 2"]
 
@@ -75,7 +75,7 @@ def interpolate(directions: DirectionSet, w: Float[Tensor, "*batch 3"]) -> Blend
     theta, phi = to_angles(w)
     rings = table.theta.to(w.dtype)
     theta = theta.clamp(max=rings[-1])
-    k = (torch.searchsorted(rings, theta.detach().contiguous(), right=True) - 1).clamp(0, len(table.count) - 1)
+    k = (torch.searchsorted(rings, theta.detach().contiguous(), right=True) - 1).clamp(0, len(table.triangles) - 1)
     f = ((theta - rings[k]) / (rings[k + 1] - rings[k]).clamp(min=torch.finfo(w.dtype).tiny)).clamp(0, 1)
     room = table.phi.shape[1]
     positions = table.phi.to(w.dtype).flatten(0, 1)
@@ -91,7 +91,7 @@ def interpolate(directions: DirectionSet, w: Float[Tensor, "*batch 3"]) -> Blend
     while step:
         edge = torch.where(place(edge + step) <= phi, edge + step, edge)
         step //= 2
-    edge = torch.minimum(edge, first + table.count[k] - 1)
+    edge = torch.minimum(edge, first + table.triangles[k] - 1)
     here, there = place(edge), place(edge + 1)
     g = ((phi - here) / (there - here).clamp(min=torch.finfo(w.dtype).tiny)).clamp(0, 1)
     inner, outer = table.node.flatten(0, 1)[edge].unbind(-1)
@@ -118,21 +118,21 @@ def strips(directions: DirectionSet) -> Strips:
     else:
         pairs, theta = [(k, k + 1) for k in range(len(rings.theta) - 1)], rings.theta
     zipped = [_zip(rings, inner, outer) for inner, outer in pairs]
-    count = torch.tensor([len(edges) - 1 for edges in zipped])
-    room = 1 << int(count.max()).bit_length()
+    triangles = torch.tensor([len(edges) - 1 for edges in zipped])
+    room = 1 << int(triangles.max()).bit_length()
     phi = torch.full((len(zipped), room, 2), BEYOND, dtype=torch.float64)
     node = torch.zeros(len(zipped), room, 2, dtype=torch.long)
     for strip, edges in enumerate(zipped):
         phi[strip, : len(edges)] = torch.tensor([edge[:2] for edge in edges], dtype=torch.float64)
         node[strip, : len(edges)] = torch.tensor([edge[2:] for edge in edges])
-    return Strips(theta, count, phi, node)
+    return Strips(theta, triangles, phi, node)
 
 
 def _zip(rings: hemisphere.Rings, inner: int, outer: int) -> list[tuple[float, float, int, int]]:
     """Return the cross edges of a strip: azimuths and nodes inside and outside, around the whole turn."""
-    (n_in, n_out), (at_in, at_out), (first_in, first_out) = (
-        (x[inner].item(), x[outer].item()) for x in (rings.size, rings.phi0, rings.offset)
-    )
+    n_in, n_out = int(rings.size[inner]), int(rings.size[outer])
+    at_in, at_out = float(rings.phi0[inner]), float(rings.phi0[outer])
+    first_in, first_out = int(rings.offset[inner]), int(rings.offset[outer])
     turn = 2 * math.pi
     if n_in == 1 and float(rings.theta[inner]) == 0:  # the pole has every azimuth
         angles = [at_out + turn * j / n_out for j in range(n_out + 1)]

@@ -305,8 +305,8 @@ def _harmonic_components(pool: "_Pool", btf: ShPcaBtf) -> np.ndarray:
 def _triangles(directions: DirectionSet) -> tuple[Float32[np.ndarray, "strip 4"], Float32[np.ndarray, "edge 4"]]:
     """Return the strips between rings, and their cross edges."""
     table = triangulation.strips(directions)
-    room = torch.full_like(table.count, table.phi.shape[1])
-    strips = torch.stack([table.theta[:-1], table.theta.diff(), table.count, room], -1)
+    room = torch.full_like(table.triangles, table.phi.shape[1])
+    strips = torch.stack([table.theta[:-1], table.theta.diff(), table.triangles, room], -1)
     return strips.float().numpy(), torch.cat([table.phi, table.node], -1).flatten(0, 1).float().numpy()
 
 
