@@ -13,11 +13,12 @@ from torch import Tensor
 
 from torchmeso.algebra import gram, secular
 from torchmeso.algebra.spherical_harmonics import basis
-from torchmeso.bench import harmonics
+from torchmeso.bench import harmonics, sh_pca
 from torchmeso.bench.suite import Context, Measurement, Row
 from torchmeso.bench.timing import time_together
 from torchmeso.compress import double_sh
 from torchmeso.compress import eigen as eigen_fit
+from torchmeso.compress import sh_pca as sh_pca_fit
 from torchmeso.compress.double_sh import DoubleShOptions, Side
 from torchmeso.geometry import hemisphere
 from torchmeso.meso import bake_btf, generators
@@ -177,7 +178,7 @@ def eigen(context: Context) -> Iterator[Row]:
 
 
 def rate(context: Context) -> Iterator[Row]:
-    """Error over size on a baked material: double SH over the dial of its energy, and eigen BTFs over their rank."""
+    """Error over size on a baked material: double SH over the dial of its energy, eigen and SH + PCA BTFs over rank."""
     options = BtfOptions(texels=32, lights="ubo81", views="ubo81", samples=1, bounces=0)
     table = bake_btf.in_memory(generators.brick(), options)
     T = table.pictures().float()
@@ -202,6 +203,9 @@ def rate(context: Context) -> Iterator[Row]:
         model = eigen_fit.fit(table, eigen_fit.EigenOptions(rank=rank))
         shown = torch.einsum("lhwkc,vk->lvhwc", model.decoded(), model.weights)
         yield row("eigen", str(rank), shown, 81 * rank)
+    for rank in (2, 4, 8, 16, 32):
+        model = sh_pca_fit.fit(table, sh_pca_fit.ShPcaOptions(rank=rank))
+        yield row("sh-pca", str(rank), sh_pca.shown(model, table.lights), 27 * rank)
 
 
 def _ratio(id: str, what: str, value: float, better: str, goal: float, n: int, peer: str) -> Row:
@@ -286,6 +290,7 @@ MEASUREMENTS = (
     Measurement("compress.quantised", quantised),
     Measurement("compress.eigen", eigen),
     Measurement("compress.rate", rate),
+    Measurement("compress.sh_pca", sh_pca.rows),
     Measurement("compress.sh", harmonics.basis),
     Measurement("compress.rotation", harmonics.rotation),
 )
