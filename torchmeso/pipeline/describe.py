@@ -163,22 +163,26 @@ def _model(path: Path) -> dict[str, Any]:
             "BTF data": _held(model, "sh."),
         }
     if "sh_pca" in model.meta:
-        sh = model.meta["sh_pca"]
-        first = model.read("sh_pca.map.0")
-        about |= {
-            "rank": sh["rank"],
-            "coefficients": f"{sh['terms']} of the light",
-            "domain": sh["domain"],
-            "lights": sh["lights"],
-            "views": sh["views"],
-            "texels": f"{first.shape[2]} x {first.shape[1]}",
-            "storage": str(first.dtype).removeprefix("torch."),
-            "BTF data": _held(model, "sh_pca."),
-        }
+        with store.reading(path):
+            about |= _sh_pca(model)
     if "mdf" in model.meta:
         about["MDF"] = f"{model.meta['mdf']['directions']}, h = {model.meta['mdf']['h']:g} tiles"
         about["MDF data"] = _held(model, "mdf.")
     return {**about, "on disk": _size(path)}
+
+
+def _sh_pca(model: store.Model) -> dict[str, Any]:
+    sh, first = model.meta["sh_pca"], model.read("sh_pca.map.0")
+    return {
+        "rank": sh["rank"],
+        "coefficients": f"{sh['terms']} of the light",
+        "domain": sh["domain"],
+        "lights": sh["lights"],
+        "views": sh["views"],
+        "texels": f"{first.shape[2]} x {first.shape[1]}",
+        "storage": str(first.dtype).removeprefix("torch."),
+        "BTF data": _held(model, "sh_pca."),
+    }
 
 
 def _config(path: Path) -> dict[str, Any]:
