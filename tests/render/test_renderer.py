@@ -10,6 +10,7 @@ from torchmeso.compress.double_sh import DoubleShOptions
 from torchmeso.compress.eigen import EigenOptions
 from torchmeso.compress.sh_pca import ShPcaOptions
 from torchmeso.data.sh_btf import ShBtf
+from torchmeso.data.sh_pca_btf import ShPcaBtf
 from torchmeso.data.textured import Textured
 from torchmeso.errors import BackendError
 from torchmeso.geometry import hemisphere, mesh, shapes
@@ -511,6 +512,18 @@ def test_harmonics_have_a_limit_on_the_device(device):
     many = ShBtf(maps=torch.zeros(81, 1, 1, 1, 3), scale=one, offset=one, lights=far, views=far)
     body = Object(mesh=shapes.plane(size=(1.0, 1.0), tiles=(1, 1)), material=Material(btf=many))
     with pytest.raises(BackendError, match="expected at most 64 coefficients of light or view, got 81"):
+        Renderer(Scene(objects=(body,), lights=()))
+
+
+@pytest.mark.parametrize(("rank", "terms", "message"), [(3, 81, "64 coefficients .* got 81"), (193, 1, "192 comp")])
+def test_components_have_a_limit_on_the_device(rank, terms, message, device):
+    pole = hemisphere.from_rings([0], [1], [0])
+    many = ShPcaBtf(
+        maps=torch.zeros(1, 1, 1, rank), scale=torch.ones(rank), offset=torch.zeros(rank),
+        basis=torch.zeros(rank, terms, 3), lights=pole, views=pole,
+    )  # fmt: skip
+    body = Object(mesh=shapes.plane(size=(1.0, 1.0), tiles=(1, 1)), material=Material(btf=many))
+    with pytest.raises(BackendError, match=message):
         Renderer(Scene(objects=(body,), lights=()))
 
 
