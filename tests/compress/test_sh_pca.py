@@ -51,7 +51,7 @@ def test_projection_gives_harmonics_of_the_light_back(domain):
 def test_the_cube_map_is_fine_enough(monkeypatch):
     options = ShPcaOptions(domain="sphere_projection")
     found = sh_pca.projection(LIGHTS, options).vector
-    monkeypatch.setattr(sh_pca, "FACE", 256)
+    monkeypatch.setattr(sh_pca, "FACE", 128)
     finer = sh_pca.projection(LIGHTS, options).vector
     assert (found - finer).norm() < 1e-3 * finer.norm()
 

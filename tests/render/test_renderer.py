@@ -527,6 +527,14 @@ def test_components_have_a_limit_on_the_device(rank, terms, message, device):
         Renderer(Scene(objects=(body,), lights=()))
 
 
+def test_whole_tables_are_for_torch(device):
+    options = BtfOptions(texels=2, lights="grid(4, 2, 80)", views="grid(4, 2, 80)", samples=1, bounces=0)
+    table = bake_btf.in_memory(generators.brick(), options)
+    body = Object(mesh=shapes.plane(size=(1.0, 1.0), tiles=(1, 1)), material=Material(btf=table))
+    with pytest.raises(BackendError, match=r"expected an eigen, double-SH or SH \+ PCA BTF, got Btf"):
+        Renderer(Scene(objects=(body,), lights=()))
+
+
 @pytest.mark.slow
 def test_a_million_triangles_in_instances(brick, device):
     """A crowd of knots, looked at closely: what torch shows in float64, to the last fragment."""
