@@ -67,20 +67,8 @@ def test_from_a_mesostructure_to_a_model(tmp_path):
     few = ("--light-terms", 4, "--view-terms", 4, "--unbounded", "--mdf", mdf_path, "--out", model, "--force")
     assert run("compress", btf_path, "--method", "double-sh", *few).exit_code == 0
     assert "coefficients: 4 x 4 of light and view" in run("info", model).stdout
-    few = (
-        "--rank",
-        3,
-        "--light-terms",
-        4,
-        "--domain",
-        "sphere_projection",
-        "--training",
-        50,
-        "--out",
-        model,
-        "--force",
-    )
-    assert run("compress", btf_path, "--method", "sh-pca", *few).exit_code == 0
+    few = ("--rank", 3, "--light-terms", 4, "--domain", "sphere_projection", "--training", 50, "--ridge", 0)
+    assert run("compress", btf_path, "--method", "sh-pca", *few, "--out", model, "--force").exit_code == 0
     said = run("info", model).stdout
     assert "coefficients: 4 of the light" in said
     assert "domain: sphere_projection" in said
@@ -153,6 +141,7 @@ REFUSED = [
     (["compress", "none.btf.zarr", "--out", "x.zip"], "expected a name that ends in .meso"),
     (["compress", "a", "--energy", "2", "--out", "x.meso"], "--method eigen has no --energy"),
     (["compress", "a", "--unbounded", "--out", "x.meso"], "--method eigen has no --unbounded"),
+    (["compress", "a", "--ridge", "0", "--out", "x.meso"], "--method eigen has no --ridge"),
     (["compress", "a", "--method", "double-sh", "--rank", "3", "--out", "x.meso"], "double-sh has no --rank"),
     (["compress", "a", "--method", "sh-pca", "--unbounded", "--out", "x.meso"], "sh-pca has no --unbounded"),
     (["compress", "a", "--method", "sh-pca", "--rank", "99", "--out", "x.meso"], "compress.rank: expected 1 to 75"),
