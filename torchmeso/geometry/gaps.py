@@ -1,10 +1,7 @@
 """What a measured set of directions lacks: the rings it was meant to have, and weights that fill its gaps.
 
 Measured sets name their directions by angles in degrees. `meant` finds the rings behind them, `locate` the place of
-each, and `filling` weighs those present for each one missing: a membrane, the solution of Laplace's equation on
-(theta, phi), whose value at a missing direction follows from its neighbours on the ring and on the rings inside and
-outside, with missing neighbours solved for at the same time. It keeps what is present, gives constants back, and
-spans whole missing rings.
+each, and `filling` weighs those present for each one missing (`geometry.kriging`), also over whole missing rings.
 
 Test: tests/geometry/test_gaps.py
 """
@@ -18,8 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchmeso.errors import FormatError
-from torchmeso.geometry import hemisphere
-from torchmeso.geometry.directions import from_angles, to_angles
+from torchmeso.geometry import hemisphere, kriging
 from torchmeso.geometry.hemisphere import DirectionSet
 
 Angles = tuple[float, float]
@@ -116,46 +112,13 @@ def filling(directions: DirectionSet, present: Bool[Tensor, "direction"]) -> Flo
     Rows sum to 1; columns of missing directions are 0. At least one direction must be present.
     """
     n = len(directions)
-    stencil = torch.zeros(n, n, dtype=torch.float64)
-    for i in (~present).nonzero()[:, 0].tolist():
-        stencil[i] = _neighbours(directions, i)
-    missing = ~present
     weights = torch.eye(n, dtype=torch.float64) * present
+    missing = ~present
     if bool(missing.any()):
-        system = torch.eye(int(missing.sum()), dtype=torch.float64) - stencil[missing][:, missing]
-        filled = torch.linalg.solve(system, stencil[missing][:, present])
-        filled = torch.where(filled < SMALL, 0, filled)
+        w = directions.directions(torch.float64)
+        filled = kriging.weights(w[present], w[missing])
+        filled = torch.where(filled.abs() < SMALL, 0, filled)
         rows = torch.zeros(len(filled), n, dtype=torch.float64)
         rows[:, present] = filled / filled.sum(1, keepdim=True)
         weights[missing] = rows
     return weights
-
-
-def _neighbours(directions: DirectionSet, i: int) -> Float[Tensor, "direction"]:
-    """Return the shares of a direction's neighbours: on its ring, and where its azimuth meets the next rings."""
-    shares = torch.zeros(directions.n_nodes, dtype=torch.float64)
-    last = torch.tensor(directions.count).cumsum(0)
-    k = int(torch.searchsorted(last, i, right=True))
-    theta, count = (math.radians(directions.theta_deg[k]), directions.count[k])
-    first = int(last[k]) - count
-    phi = to_angles(directions.directions(torch.float64)[i])[1]
-    gaps = {
-        ring: abs(math.radians(directions.theta_deg[ring]) - theta)
-        for ring in (k - 1, k + 1)
-        if 0 <= ring < len(directions.count)
-    }
-    for ring, gap in gaps.items():
-        share = 2 / (gap * sum(gaps.values()))  # the second difference over uneven steps
-        if theta == 0:  # the pole sees the whole ring
-            start = int(last[ring]) - directions.count[ring]
-            shares[start : int(last[ring])] += share / directions.count[ring]
-        else:
-            other = torch.tensor(math.radians(directions.theta_deg[ring]), dtype=torch.float64)
-            taps = hemisphere.interpolate(directions, from_angles(other, phi))
-            shares.index_add_(0, taps.node, share * taps.weight)
-    if count > 1:
-        step = math.sin(theta) * 2 * math.pi / count
-        for j in (i - 1, i + 1):
-            shares[first + (j - first) % count] += 1 / step**2
-    shares = shares[: len(directions)]  # a pole that is no direction of the set cannot be asked for: theta > 0 here
-    return shares / shares.sum()
