@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchmeso.algebra import gram, secular
 from torchmeso.algebra.spherical_harmonics import basis
-from torchmeso.bench import harmonics, held_out
+from torchmeso.bench import harmonics, held_out, sweeps
 from torchmeso.bench.suite import Context, Measurement, Row
 from torchmeso.bench.timing import time_together
 from torchmeso.compress import double_sh
@@ -289,4 +289,5 @@ MEASUREMENTS = (
     Measurement("compress.sh", harmonics.basis),
     Measurement("compress.rotation", harmonics.rotation),
     *held_out.MEASUREMENTS,
+    *sweeps.MEASUREMENTS,
 )
