@@ -144,7 +144,11 @@ def _bake_one(meso: str, out: Any, force: bool, options: dict[str, Any]) -> None
 @main.command()
 @click.argument("table")
 @click.option(
-    "--method", default="eigen", type=click.Choice(["eigen", "double-sh"]), show_default=True, help="Kind of model."
+    "--method",
+    default="eigen",
+    type=click.Choice(["eigen", "double-sh", "ptm", "hsh"]),
+    show_default=True,
+    help="Kind of model; ptm and hsh: of an RTI set (.lp).",
 )
 @click.option("--rank", type=int, help="eigen: components kept, at most the number of views [4].")
 @click.option("--light-terms", type=int, help="double-sh: coefficients over the light: 1, 4, 9, 16, 25, 36 [25].")
@@ -154,12 +158,14 @@ def _bake_one(meso: str, out: Any, force: bool, options: dict[str, Any]) -> None
 )
 @click.option("--unbounded", is_flag=True, help="double-sh: plain least squares.")
 @click.option("--regularise", is_flag=True, help="double-sh: more coefficients than the directions tell apart.")
+@click.option("--terms", type=int, help="hsh: 4, 9 or 16 [9].")
+@click.option("--per-channel", is_flag=True, help="ptm: a polynomial for each channel instead of one and a colour.")
 @click.option(
     "--storage", default="uint8", show_default=True, type=click.Choice(["uint8", "float16", "float32"]), help="Of maps."
 )
 @click.option("--mdf", "silhouette", help="MDF table (.mdf.zarr) to pack into the model.")
 @click.option("--allow-missing", is_flag=True, help="Interpolate pictures that a folder or zip lacks.")
-@click.option("--out", required=True, help="The run-time model (.meso).")
+@click.option("--out", required=True, help="The run-time model (.meso); of ptm .ptm, of hsh .rti.")
 @click.option("--force", is_flag=True, help="Replace an existing model.")
 def compress(
     table: str,
@@ -171,11 +177,14 @@ def compress(
     force: bool,
     **options: Any,
 ) -> None:
-    """Compress a BTF TABLE (.btf.zarr or .btf, or a folder or zip of pictures) into a run-time model."""
+    """Compress a BTF TABLE (.btf.zarr or .btf, a folder or zip of pictures, or an RTI set .lp) into a small model."""
     from torchmeso.compress import double_sh, eigen
     from torchmeso.data import eigen_btf, mdf, sh_btf
     from torchmeso.pipeline import picture_sets
 
+    if method in ("ptm", "hsh"):
+        _relight(table, method, out, force, options)
+        return
     if not out.endswith(".meso"):
         raise ConfigError(f"{out}: expected a name that ends in .meso")
     _refuse_to_replace(out, force)
@@ -195,6 +204,18 @@ def compress(
             eigen_btf.save(eigen.fit(source, chosen, progress=told), out, silhouette=depth)
         else:
             sh_btf.save(double_sh.fit(source, chosen, backend="auto", progress=told), out, silhouette=depth)
+    click.echo(out)
+
+
+def _relight(lights: str, method: Any, out: str, force: bool, options: dict[str, Any]) -> None:
+    from torchmeso.pipeline import relight
+
+    own = {"terms", "per_channel", "storage"}  # storage has a default: it was not asked for
+    wrong = sorted(name for name, value in options.items() if name not in own and value not in (None, False))
+    if wrong:
+        raise ConfigError(f"compress: --method {method} has no --{wrong[0].replace('_', '-')}")
+    _refuse_to_replace(out, force)
+    relight.fit(lights, out, method=method, terms=options["terms"], per_channel=options["per_channel"])
     click.echo(out)
 
 

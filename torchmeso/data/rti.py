@@ -30,7 +30,7 @@ class LightSet:
     """Pictures of one view under several lights.
 
     Attributes:
-        files: a picture per light, JPEG or PNG.
+        files: a picture per light: JPEG, PNG or TIFF.
         directions: (light, 3) unit, towards the light.
     """
 
