@@ -333,15 +333,19 @@ def export(file: str, out: str, method: Any, rank: int | None, force: bool) -> N
 @main.command()
 @click.argument("a")
 @click.argument("b")
-@click.option("--out", help="Picture of the difference (.png): four times the absolute difference.")
+@click.option("--out", help="Picture (.png): of two pictures four times their difference, of BTFs PSNR by direction.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON for machines.")
 def compare(a: str, b: str, out: str | None, as_json: bool) -> None:
-    """Compare picture B with its reference A: PSNR, SSIM, FLIP, largest error."""
+    """Compare picture B with its reference A: PSNR, SSIM, FLIP, largest error; or BTF model B with its table A."""
     from dataclasses import asdict
 
     from torchmeso import quality
     from torchmeso.data import image
+    from torchmeso.pipeline import directional_error
 
+    if directional_error.is_btf(a):
+        _compare_btf(a, b, out, as_json)
+        return
     reference, picture = image.read(a), image.read(b)
     found = quality.compare(reference, picture)
     if out is not None:
@@ -351,6 +355,28 @@ def compare(a: str, b: str, out: str | None, as_json: bool) -> None:
         return
     flip = "flip not installed" if found.flip is None else f"FLIP {found.flip:.4f}"
     click.echo(f"PSNR {found.psnr:.2f} dB  SSIM {found.ssim:.4f}  {flip}  max error {found.max_error:.4g}")
+
+
+def _compare_btf(a: str, b: str, out: str | None, as_json: bool) -> None:
+    from torchmeso.geometry import gaps
+    from torchmeso.pipeline import directional_error
+
+    with _progress() as report:
+        found = directional_error.compare(a, b, report)
+    if out is not None:
+        directional_error.draw(found, out)
+    sides = {"light": (found.lights, found.over_lights), "view": (found.views, found.over_views)}
+    if as_json:
+        lists = {f"over_{side}s": psnr.tolist() for side, (_, psnr) in sides.items()}
+        click.echo(json.dumps({"psnr": found.whole, "max_error": found.max_error, **lists}))
+        return
+    worst = [
+        "worst {} {:.2f} dB at theta {:g}, phi {:g}".format(
+            side, float(psnr.min()), *gaps.angles_deg(directions)[int(psnr.argmin())]
+        )
+        for side, (directions, psnr) in sides.items()
+    ]
+    click.echo(f"PSNR {found.whole:.2f} dB  {'  '.join(worst)}  max error {found.max_error:.4g}")
 
 
 @main.command()
