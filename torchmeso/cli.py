@@ -301,7 +301,10 @@ def _render_frames(settings: Any, out: str, truth: bool, force: bool, options: d
 @main.command()
 @click.argument("file")
 @click.option(
-    "--to", "out", required=True, help="The file to write: .glb (glTF 2.0); of a BTF .btf (Bonn), or a folder of EXR."
+    "--to",
+    "out",
+    required=True,
+    help="The file to write: .glb (glTF 2.0); of a BTF .btf (Bonn) or a folder of EXR; of a model a folder.",
 )
 @click.option(
     "--method",
@@ -313,15 +316,19 @@ def _render_frames(settings: Any, out: str, truth: bool, force: bool, options: d
 @click.option("--rank", type=int, help="Of .btf, dfmf: components of each colour channel [64, or all there are].")
 @click.option("--force", is_flag=True, help="Replace an existing file.")
 def export(file: str, out: str, method: Any, rank: int | None, force: bool) -> None:
-    """Write FILE for other programs: a mesh or all objects of a configuration where they stand, or a BTF."""
+    """Write FILE for other programs: a mesh or all objects of a configuration where they stand, a BTF or a model."""
     from torchmeso.pipeline import export as job
+    from torchmeso.pipeline import textures
 
-    stack = file.rstrip("/").endswith(".btf.zarr") and not out.lower().endswith((".glb", ".btf"))
-    if not (stack or out.lower().endswith((".glb", ".btf"))):
-        raise ConfigError(f"{out}: expected a name that ends in .glb or .btf, or of a BTF table a folder")
+    maps, table = file.endswith(".meso"), file.rstrip("/").endswith(".btf.zarr")
+    one_file = out.lower().endswith((".glb", ".btf"))
+    if maps if one_file else not (maps or table):
+        raise ConfigError(f"{out}: expected a name that ends in .glb or .btf, or of a BTF table or a model a folder")
     _refuse_to_replace(out, force)
     with _progress() as report:
-        if stack:
+        if maps:
+            textures.write(file, out, report)
+        elif not one_file:
             job.to_exr_stack(file, out, report)
         elif out.lower().endswith(".btf"):
             job.to_bonn(file, out, method=method, rank=rank, report=report)
