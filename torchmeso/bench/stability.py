@@ -15,7 +15,7 @@ from typing import TypeVar
 
 import torch
 
-from torchmeso.bench import extremes, fuzz
+from torchmeso.bench import extremes, fuzz, fuzz_readers
 from torchmeso.bench.extremes import Case
 from torchmeso.bench.suite import Context, Measurement, Row, resident_peak
 from torchmeso.compress import eigen
@@ -233,4 +233,5 @@ MEASUREMENTS = [
     Measurement("condition", condition),
     Measurement("large", large),
     *fuzz.MEASUREMENTS,
+    *fuzz_readers.MEASUREMENTS,
 ]
