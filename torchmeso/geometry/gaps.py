@@ -8,21 +8,20 @@ Test: tests/geometry/test_gaps.py
 
 import math
 from collections.abc import Collection, Sequence
-from itertools import accumulate
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchmeso.errors import FormatError
-from torchmeso.geometry import hemisphere, kriging
+from torchmeso.geometry import hemisphere, kriging, rings
 from torchmeso.geometry.hemisphere import DirectionSet
 
 Angles = tuple[float, float]
 """theta and phi in degrees."""
 
-TOLERANCE_DEG = 0.6
-"""Names round angles to whole degrees."""
+TOLERANCE_DEG = 0.75
+"""Names round both angles to whole degrees: up to 0.71 degrees between directions."""
 
 MOST = 4096
 """Directions of a set that is told from angles: rigs take some hundred, damaged names could mean millions."""
@@ -56,10 +55,10 @@ def meant(angles: Collection[Angles], name: str) -> DirectionSet:
     if not any(place is None for place in locate(hemisphere.ubo81(), angles)):
         return hemisphere.ubo81()
     thetas = sorted({theta for theta, _ in angles})
-    rings = [_ring(sorted(phi for t, phi in angles if t == theta), theta, name) for theta in thetas]
-    if sum(count for count, _ in rings) > MOST:
+    found = [_ring(sorted(phi for t, phi in angles if t == theta), theta, name) for theta in thetas]
+    if sum(count for count, _ in found) > MOST:
         raise FormatError(f"{name}: expected at most {MOST} directions on rings, got steps of a fraction of a degree")
-    return hemisphere.from_rings(thetas, *zip(*rings, strict=True))
+    return hemisphere.from_rings(thetas, *zip(*found, strict=True))
 
 
 def _ring(phis: Sequence[float], theta: float, name: str) -> tuple[int, float]:
@@ -68,27 +67,22 @@ def _ring(phis: Sequence[float], theta: float, name: str) -> tuple[int, float]:
         return 1, phis[0]
     step = min((b - a) % 360 for a, b in zip(phis, [*phis[1:], phis[0]], strict=True))
     count = round(360 / step)
-    off = [abs((phi - phis[0]) * count / 360 - round((phi - phis[0]) * count / 360)) * 360 / count for phi in phis]
-    if max(off) > TOLERANCE_DEG:
+    first = rings.first_azimuth(torch.tensor(phis, dtype=torch.float64), count)
+    steps = [(phi - first) * count / 360 for phi in phis]
+    if max(abs(x - round(x)) * 360 / count for x in steps) > TOLERANCE_DEG:
         raise FormatError(
             f"{name}: expected even steps in azimuth at theta {theta:g}, got {', '.join(f'{p:g}' for p in phis[:6])}; "
             "only directions on rings can be read"
         )
-    return count, phis[0] % (360 / count)
+    return count, first
 
 
 def locate(directions: DirectionSet, angles: Collection[Angles]) -> list[int | None]:
     """Return the index of each of `angles` (degrees) in the set, None where it has none there."""
-    firsts = [0, *accumulate(directions.count)]
-    places: list[int | None] = []
-    for theta, phi in angles:
-        k = min(range(len(directions.count)), key=lambda ring: abs(theta - directions.theta_deg[ring]))
-        ring, count, phi0 = directions.theta_deg[k], directions.count[k], directions.phi0_deg[k]
-        j = round((phi - phi0) * count / 360)
-        off = abs(phi - phi0 - 360 * j / count) if ring > 0 else 0.0
-        there = abs(theta - ring) <= TOLERANCE_DEG and off <= TOLERANCE_DEG
-        places.append(firsts[k] + j % count if there else None)
-    return places
+    if not angles:
+        return []
+    places, off = rings.nearest(directions, torch.tensor(list(angles), dtype=torch.float64))
+    return [p if away <= TOLERANCE_DEG else None for p, away in zip(places.tolist(), off.tolist(), strict=True)]
 
 
 def turned(angles: Angles) -> Angles:
