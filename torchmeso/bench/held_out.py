@@ -91,14 +91,12 @@ def baked(context: Context, *, texels: int = 16, count: int = 60) -> Iterator[Ro
 
 def _side(material: str, directions: DirectionSet, side: str, texels: int, count: int) -> Iterator[Row]:
     """Hold out directions of one side; the other side is asked for where it was fitted."""
-    other = "views" if side == "lights" else "lights"
     asked, few = anywhere(count, directions.last), hemisphere.parse(FEW)
 
     def bake(of: DirectionSet) -> bake_btf.Btf:
-        sets = {side: of.name, other: few.name}
-        return bake_btf.in_memory(
-            generators.GENERATORS[material](), BtfOptions(texels=texels, samples=4, bounces=0, **sets)
-        )
+        lights, views = (of.name, few.name) if side == "lights" else (few.name, of.name)
+        options = BtfOptions(texels=texels, samples=4, bounces=0, lights=lights, views=views)
+        return bake_btf.in_memory(generators.GENERATORS[material](), options)
 
     table, truth = bake(directions), bake(asked)
     model = eigen.fit(table, EigenOptions(rank=len(table.views), storage="float32"))

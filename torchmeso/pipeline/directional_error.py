@@ -165,7 +165,7 @@ def draw(found: DirectionalError, path: str | Path) -> None:
         import matplotlib
 
         matplotlib.use("Agg")
-        from matplotlib import pyplot
+        from matplotlib import cm, colors, pyplot
     except ImportError as error:
         raise BackendError("compare: expected matplotlib; install the extra: torchmeso[report]") from error
     panels = {
@@ -174,16 +174,17 @@ def draw(found: DirectionalError, path: str | Path) -> None:
     }
     low, high = (float(f(torch.cat([x for _, x in panels.values()]))) for f in (torch.min, torch.max))
     figure, axes = pyplot.subplots(1, 2, figsize=(10, 4.8), subplot_kw={"projection": "polar"})
-    dots = None
+    shade = cm.ScalarMappable(colors.Normalize(low, max(high, low + 1e-3)), "viridis")
     for axis, (title, (directions, psnr)) in zip(axes, panels.items(), strict=True):
         theta, phi = zip(*gaps.angles_deg(directions), strict=True)
-        size = max(20.0, 6000.0 / len(directions))
-        dots = axis.scatter(
-            [math.radians(x) for x in phi], theta, c=psnr.numpy(), s=size, vmin=low, vmax=max(high, low + 1e-3)
-        )
+        size = max(20.0, 9000.0 / len(directions))
+        around = [math.radians(x) for x in phi]
+        axis.scatter(around, theta, c=psnr.numpy(), s=size, cmap=shade.cmap, norm=shade.norm, zorder=3)
         axis.set_rlim(0, 90)
+        axis.set_rticks([30, 60, 90])
+        axis.grid(alpha=0.4)
         axis.set_title(title, fontsize=10)
-    figure.colorbar(dots, ax=list(axes), label="PSNR (dB)", shrink=0.8)
+    figure.colorbar(shade, ax=list(axes), label="PSNR (dB)", shrink=0.8)
     with replacing(path) as beside:
         figure.savefig(beside, format=Path(path).suffix.lstrip(".").lower() or "png", dpi=110)
     pyplot.close(figure)
