@@ -1,3 +1,4 @@
+import errno
 import json
 
 import numpy as np
@@ -13,7 +14,7 @@ from torchmeso.compress.eigen import EigenOptions
 from torchmeso.data import eigen_btf, image, sh_btf
 from torchmeso.data.btf import Btf
 from torchmeso.data.mdf import Mdf
-from torchmeso.errors import ConfigError
+from torchmeso.errors import ConfigError, StorageError
 from torchmeso.geometry import hemisphere
 from torchmeso.pipeline import textures
 from torchmeso.render.scene import Material
@@ -86,6 +87,20 @@ def test_a_folder_that_stood_there_is_replaced_whole(table, tmp_path):
     textures.write(tmp_path / "a.meso", tmp_path / "maps")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.meso", "maps"]
     assert sorted(p.name for p in (tmp_path / "maps").iterdir()) == ["ambient.exr", "eigen", "maps.json"]
+
+
+@pytest.mark.errors
+def test_a_full_disk_is_one_sentence_and_leaves_what_stood_there(table, tmp_path, monkeypatch):
+    def fail(self, *_, **__):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    eigen_btf.save(eigen.fit(table, EigenOptions(rank=1)), tmp_path / "a.meso")
+    (tmp_path / "maps").mkdir()
+    (tmp_path / "maps" / "old.png").write_bytes(b"old")
+    monkeypatch.setattr(Image.Image, "save", fail)
+    with pytest.raises(StorageError, match="No space left"):
+        textures.write(tmp_path / "a.meso", tmp_path / "maps")
+    assert (tmp_path / "maps" / "old.png").read_bytes() == b"old"
 
 
 @pytest.mark.errors
