@@ -85,7 +85,7 @@ def held_out(context: Context) -> Iterator[Row]:
     yield from baked(context)
 
 
-def baked(context: Context, *, texels: int = 16, count: int = 60) -> Iterator[Row]:
+def baked(context: Context, *, texels: int = 16, count: int = 240) -> Iterator[Row]:
     """Materials baked twice: where they are fitted, and where they are asked for."""
     materials = ("brick",) if context.quick else ("brick", "weave", "pipes", "spheres", "bark")
     for material in materials:

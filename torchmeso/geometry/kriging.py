@@ -6,9 +6,9 @@ With p(w) = (x, y) / (1 + z), the parabolic map of the hemisphere to the unit di
 
 kriging whose variogram is linear, the best guess for values that differ by as much as a random walk over the disc. It
 is linear in the values, exact at what is known, gives constants back, and needs no triangulation, no count of
-neighbours and no exponent. Rougher and smoother kernels (thin plates, cubes) win on smooth materials and overshoot on
-others; this one is nearer to held-out pictures than nearest, inverse-distance and barycentric interpolation on every
-material measured (rows `compress.held_out`).
+neighbours and no exponent. Smoother kernels (thin plates, cubes) win on smooth materials and overshoot on others; this
+one is nearer to held-out pictures than nearest, inverse-distance and barycentric interpolation, but for views of brick,
+where it is level with the best of them (rows `compress.held_out`).
 
 Renderers cannot solve for every pixel. `finer` tabulates the function once on rings twice as dense, between which
 linear interpolation (`geometry.hemisphere`) is as near: a few more kilobytes for what has no texels.
