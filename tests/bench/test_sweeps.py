@@ -8,7 +8,7 @@ CURVES = sweeps.curves()
 
 @pytest.mark.parametrize("name", CURVES)
 def test_no_container_jumps(name):
-    assert sweeps.halving(CURVES[name], 500) < 0.6  # measured 0.50 to 0.54
+    assert sweeps.halving(CURVES[name], 300) < 0.6  # measured 0.50 to 0.54
 
 
 def test_a_step_is_seen_beside_slopes():
