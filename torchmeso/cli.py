@@ -146,9 +146,9 @@ def _bake_one(meso: str, out: Any, force: bool, options: dict[str, Any]) -> None
 @click.option(
     "--method",
     default="eigen",
-    type=click.Choice(["eigen", "double-sh", "sh-pca"]),
+    type=click.Choice(["eigen", "double-sh", "sh-pca", "ptm", "hsh"]),
     show_default=True,
-    help="Kind of model.",
+    help="Kind of model; ptm and hsh: of an RTI set (.lp).",
 )
 @click.option("--rank", type=int, help="eigen: components kept, at most the number of views [4]; sh-pca [16].")
 @click.option(
@@ -167,12 +167,14 @@ def _bake_one(meso: str, out: Any, force: bool, options: dict[str, Any]) -> None
 )
 @click.option("--ridge", type=float, help="sh-pca: how much small coefficients count beside small errors [1e-4].")
 @click.option("--training", type=int, help="sh-pca: vectors to find the components from, drawn at random [all].")
+@click.option("--terms", type=int, help="hsh: 4, 9 or 16 [9].")
+@click.option("--per-channel", is_flag=True, help="ptm: a polynomial for each channel instead of one and a colour.")
 @click.option(
     "--storage", default="uint8", show_default=True, type=click.Choice(["uint8", "float16", "float32"]), help="Of maps."
 )
 @click.option("--mdf", "silhouette", help="MDF table (.mdf.zarr) to pack into the model.")
 @click.option("--allow-missing", is_flag=True, help="Interpolate pictures that a folder or zip lacks.")
-@click.option("--out", required=True, help="The run-time model (.meso).")
+@click.option("--out", required=True, help="The run-time model (.meso); of ptm .ptm, of hsh .rti.")
 @click.option("--force", is_flag=True, help="Replace an existing model.")
 def compress(
     table: str,
@@ -184,11 +186,14 @@ def compress(
     force: bool,
     **options: Any,
 ) -> None:
-    """Compress a BTF TABLE (.btf.zarr or .btf, or a folder or zip of pictures) into a run-time model."""
+    """Compress a BTF TABLE (.btf.zarr or .btf, a folder or zip of pictures, or an RTI set .lp) into a small model."""
     from torchmeso.compress import double_sh, eigen, sh_pca
     from torchmeso.data import eigen_btf, mdf, sh_btf, sh_pca_btf
     from torchmeso.pipeline import picture_sets
 
+    if method in ("ptm", "hsh"):
+        _relight(table, method, out, force, options)
+        return
     if not out.endswith(".meso"):
         raise ConfigError(f"{out}: expected a name that ends in .meso")
     _refuse_to_replace(out, force)
@@ -211,6 +216,18 @@ def compress(
             sh_pca_btf.save(sh_pca.fit(source, chosen, progress=told), out, silhouette=depth)
         else:
             sh_btf.save(double_sh.fit(source, chosen, backend="auto", progress=told), out, silhouette=depth)
+    click.echo(out)
+
+
+def _relight(lights: str, method: Any, out: str, force: bool, options: dict[str, Any]) -> None:
+    from torchmeso.pipeline import relight
+
+    own = {"terms", "per_channel", "storage"}  # storage has a default: it was not asked for
+    wrong = sorted(name for name, value in options.items() if name not in own and value not in (None, False))
+    if wrong:
+        raise ConfigError(f"compress: --method {method} has no --{wrong[0].replace('_', '-')}")
+    _refuse_to_replace(out, force)
+    relight.fit(lights, out, method=method, terms=options["terms"], per_channel=options["per_channel"])
     click.echo(out)
 
 
@@ -296,7 +313,10 @@ def _render_frames(settings: Any, out: str, truth: bool, force: bool, options: d
 @main.command()
 @click.argument("file")
 @click.option(
-    "--to", "out", required=True, help="The file to write: .glb (glTF 2.0); of a BTF .btf (Bonn), or a folder of EXR."
+    "--to",
+    "out",
+    required=True,
+    help="The file to write: .glb (glTF 2.0); of a BTF .btf (Bonn) or a folder of EXR; of a model a folder.",
 )
 @click.option(
     "--method",
@@ -308,15 +328,19 @@ def _render_frames(settings: Any, out: str, truth: bool, force: bool, options: d
 @click.option("--rank", type=int, help="Of .btf, dfmf: components of each colour channel [64, or all there are].")
 @click.option("--force", is_flag=True, help="Replace an existing file.")
 def export(file: str, out: str, method: Any, rank: int | None, force: bool) -> None:
-    """Write FILE for other programs: a mesh or all objects of a configuration where they stand, or a BTF."""
+    """Write FILE for other programs: a mesh or all objects of a configuration where they stand, a BTF or a model."""
     from torchmeso.pipeline import export as job
+    from torchmeso.pipeline import textures
 
-    stack = file.rstrip("/").endswith(".btf.zarr") and not out.lower().endswith((".glb", ".btf"))
-    if not (stack or out.lower().endswith((".glb", ".btf"))):
-        raise ConfigError(f"{out}: expected a name that ends in .glb or .btf, or of a BTF table a folder")
+    maps, table = file.endswith(".meso"), file.rstrip("/").endswith(".btf.zarr")
+    one_file = out.lower().endswith((".glb", ".btf"))
+    if maps if one_file else not (maps or table):
+        raise ConfigError(f"{out}: expected a name that ends in .glb or .btf, or of a BTF table or a model a folder")
     _refuse_to_replace(out, force)
     with _progress() as report:
-        if stack:
+        if maps:
+            textures.write(file, out, report)
+        elif not one_file:
             job.to_exr_stack(file, out, report)
         elif out.lower().endswith(".btf"):
             job.to_bonn(file, out, method=method, rank=rank, report=report)
@@ -328,15 +352,19 @@ def export(file: str, out: str, method: Any, rank: int | None, force: bool) -> N
 @main.command()
 @click.argument("a")
 @click.argument("b")
-@click.option("--out", help="Picture of the difference (.png): four times the absolute difference.")
+@click.option("--out", help="Picture (.png): of two pictures four times their difference, of BTFs PSNR by direction.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON for machines.")
 def compare(a: str, b: str, out: str | None, as_json: bool) -> None:
-    """Compare picture B with its reference A: PSNR, SSIM, FLIP, largest error."""
+    """Compare picture B with its reference A: PSNR, SSIM, FLIP, largest error; or BTF model B with its table A."""
     from dataclasses import asdict
 
     from torchmeso import quality
     from torchmeso.data import image
+    from torchmeso.pipeline import directional_error
 
+    if directional_error.is_btf(a):
+        _compare_btf(a, b, out, as_json)
+        return
     reference, picture = image.read(a), image.read(b)
     found = quality.compare(reference, picture)
     if out is not None:
@@ -346,6 +374,28 @@ def compare(a: str, b: str, out: str | None, as_json: bool) -> None:
         return
     flip = "flip not installed" if found.flip is None else f"FLIP {found.flip:.4f}"
     click.echo(f"PSNR {found.psnr:.2f} dB  SSIM {found.ssim:.4f}  {flip}  max error {found.max_error:.4g}")
+
+
+def _compare_btf(a: str, b: str, out: str | None, as_json: bool) -> None:
+    from torchmeso.geometry import gaps
+    from torchmeso.pipeline import directional_error
+
+    with _progress() as report:
+        found = directional_error.compare(a, b, report)
+    if out is not None:
+        directional_error.draw(found, out)
+    sides = {"light": (found.lights, found.over_lights), "view": (found.views, found.over_views)}
+    if as_json:
+        lists = {f"over_{side}s": psnr.tolist() for side, (_, psnr) in sides.items()}
+        click.echo(json.dumps({"psnr": found.whole, "max_error": found.max_error, **lists}))
+        return
+    worst = [
+        "worst {} {:.2f} dB at theta {:g}, phi {:g}".format(
+            side, float(psnr.min()), *gaps.angles_deg(directions)[int(psnr.argmin())]
+        )
+        for side, (directions, psnr) in sides.items()
+    ]
+    click.echo(f"PSNR {found.whole:.2f} dB  {'  '.join(worst)}  max error {found.max_error:.4g}")
 
 
 @main.command()

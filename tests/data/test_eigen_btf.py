@@ -9,7 +9,7 @@ from torchmeso.data import eigen_btf, mdf, store
 from torchmeso.data.eigen_btf import EigenBtf
 from torchmeso.data.mdf import Mdf
 from torchmeso.errors import FormatError, ShapeError
-from torchmeso.geometry import hemisphere
+from torchmeso.geometry import hemisphere, kriging
 from torchmeso.geometry.directions import from_angles, normalize
 
 LIGHTS, VIEWS = hemisphere.grid(4, 3, 80), hemisphere.grid(5, 3, 75)
@@ -39,11 +39,13 @@ def test_samples_are_weights_times_maps(rng):
 
 
 def test_interpolating_the_model_is_interpolating_its_table(rng):
-    """Maps and weights are interpolated apart; by linearity that equals the interpolated table."""
+    """Maps and weights are interpolated apart; by linearity that equals the interpolated table on the finer views."""
     from torchmeso.data.btf import Btf
 
     eigen = make(rng)
-    btf = Btf(images=full_table(eigen), lights=LIGHTS, views=VIEWS)
+    views, weights = kriging.finer(VIEWS)
+    images = torch.einsum("lvhwc,nv->lnhwc", full_table(eigen), weights)
+    btf = Btf(images=images, lights=LIGHTS, views=views)
     uv = torch.rand(300, 2, dtype=torch.float64, generator=rng) * 3 - 1
     wi, wo = normalize(torch.randn(2, 300, 3, dtype=torch.float64, generator=rng)).unbind(0)
     torch.testing.assert_close(eigen.evaluate(uv, wi, wo), btf.evaluate(uv, wi, wo), rtol=1e-9, atol=1e-10)

@@ -89,6 +89,9 @@ def test_damaged_tables_are_named(tmp_path, rng):
         path.write_text(header + f"{name},0,0,0,0\n")
         with pytest.raises(FormatError, match=rf"names the picture '{re.escape(name)}', of which there is none in"):
             exr_stack.survey(tmp_path)
+    path.write_text(header + "a\0.exr,0,0,0,0\n")
+    with pytest.raises(FormatError, match=r"cannot be read|names the picture"):  # no path may hold it
+        exr_stack.survey(tmp_path)
     (tmp_path / "a.exr").touch()
     path.write_text(header + "a.exr,nan,0,0,0\n")
     with pytest.raises(FormatError, match=r"expected polar angles .* got theta nan, phi 0"):

@@ -53,7 +53,7 @@ def test_missing_and_damaged_pictures_say_so(tmp_path):
             with pytest.raises(FormatError, match="expected a picture, found none"):
                 reader(tmp_path / name)
     (tmp_path / "bad.png").write_bytes(b"\x89PNG\r\n\x1a\n1234")
-    with pytest.raises(FormatError, match="expected a PNG, JPEG or EXR"):
+    with pytest.raises(FormatError, match="expected a PNG, JPEG, TIFF or EXR"):
         image.read(tmp_path / "bad.png")
     (tmp_path / "bad.exr").write_bytes(b"1234")
     with pytest.raises(FormatError, match="expected an OpenEXR"):
@@ -110,3 +110,51 @@ def test_nothing_but_our_errors_leaves_damaged_codes(n):
             image.read_codes(bytes(data), "a")
         except FormatError:
             continue
+
+
+@pytest.mark.parametrize("compression", ["raw", "tiff_lzw", "tiff_deflate", "packbits", "jpeg"])
+def test_tiff_is_read_like_png(tmp_path, rng, compression):
+    codes = torch.randint(0, 256, (8, 8, 3), generator=rng, dtype=torch.uint8)
+    if compression == "jpeg":
+        codes[:] = 90
+    Image.fromarray(codes.numpy()).save(tmp_path / "a.tif", compression=compression)
+    found = image.read_codes((tmp_path / "a.tif").read_bytes(), "a.tif")
+    assert int((found.int() - codes.int()).abs().max()) <= (2 if compression == "jpeg" else 0)
+    torch.testing.assert_close(image.read(tmp_path / "a.tif"), image.decode_codes(found))
+
+
+@pytest.mark.parametrize("suffix", ["tif", "png"])
+def test_sixteen_bits_are_rounded_to_eight(tmp_path, suffix):
+    """One channel of 16 bits, which Pillow itself cuts off at 255."""
+    values = np.array([[0, 257, 30000, 65535]], np.uint16)
+    Image.fromarray(values).save(tmp_path / f"a.{suffix}")
+    for found in (
+        image.read_codes((tmp_path / f"a.{suffix}").read_bytes(), "a"),
+        image.encode_codes(image.read(tmp_path / f"a.{suffix}")),
+    ):
+        assert found[0, :, 1].tolist() == [0, 1, 117, 255]
+
+
+@pytest.mark.errors
+def test_floats_in_tiff_are_refused_as_colour(tmp_path):
+    values = np.array([[0.0, 0.5]], np.float32)
+    Image.fromarray(values).save(tmp_path / "a.tif")
+    with pytest.raises(FormatError, match="expected whole numbers of 8 or 16 bits, got floats"):
+        image.read(tmp_path / "a.tif")
+    torch.testing.assert_close(image.read_data(tmp_path / "a.tif"), torch.from_numpy(values))
+
+
+@pytest.mark.errors
+def test_a_picture_that_announces_too_much_is_refused_before_it_is_decoded(tmp_path):
+    import io
+    import struct
+    import zlib
+
+    stream = io.BytesIO()
+    Image.new("RGB", (1, 1)).save(stream, "PNG")
+    content = bytearray(stream.getvalue())
+    content[16:24] = struct.pack(">II", 9000, 9000)
+    content[29:33] = struct.pack(">I", zlib.crc32(content[12:29]))
+    (tmp_path / "a.png").write_bytes(content)
+    with pytest.raises(FormatError, match="announces 9000 x 9000 pixels, too many for"):
+        image.read(tmp_path / "a.png")

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchmeso.algebra import gram, secular
 from torchmeso.algebra.spherical_harmonics import basis
-from torchmeso.bench import harmonics, sh_pca
+from torchmeso.bench import harmonics, held_out, sh_pca, sweeps
 from torchmeso.bench.suite import Context, Measurement, Row
 from torchmeso.bench.timing import time_together
 from torchmeso.compress import double_sh
@@ -293,4 +293,6 @@ MEASUREMENTS = (
     Measurement("compress.sh_pca", sh_pca.rows),
     Measurement("compress.sh", harmonics.basis),
     Measurement("compress.rotation", harmonics.rotation),
+    *held_out.MEASUREMENTS,
+    *sweeps.MEASUREMENTS,
 )

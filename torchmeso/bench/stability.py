@@ -15,7 +15,7 @@ from typing import TypeVar
 
 import torch
 
-from torchmeso.bench import extremes, fuzz
+from torchmeso.bench import extremes, fit_extremes, fuzz, fuzz_readers
 from torchmeso.bench.extremes import Case
 from torchmeso.bench.suite import Context, Measurement, Row, resident_peak
 from torchmeso.compress import eigen
@@ -232,5 +232,7 @@ MEASUREMENTS = [
     Measurement("distance", distance),
     Measurement("condition", condition),
     Measurement("large", large),
+    *fit_extremes.MEASUREMENTS,
     *fuzz.MEASUREMENTS,
+    *fuzz_readers.MEASUREMENTS,
 ]

@@ -3,7 +3,8 @@
 wang2005mdf, section 5: the BTF as a matrix with rows (x, y, light, rgb) and columns view, cut to a few singular
 vectors. E_k are maps over lights and texels (the eigen maps), W_k weights over views; one W serves all three
 channels. Maps are stored as uint8 with a scale and an offset per component and channel, or as float16 or
-float32. Interpolation is linear, so it runs on the codes and decodes once.
+float32. Interpolation is linear, so it runs on the codes and decodes once. Weights have no texels: they are
+interpolated on a finer set (`geometry.kriging`).
 
 Test: tests/data/test_eigen_btf.py
 """
@@ -22,7 +23,7 @@ from torchmeso.data.btf import horizon_falloff
 from torchmeso.data.mdf import Mdf
 from torchmeso.data.pyramid import Footprint
 from torchmeso.errors import FormatError, ShapeError, check_finite, check_shape
-from torchmeso.geometry import hemisphere
+from torchmeso.geometry import hemisphere, kriging
 from torchmeso.geometry.hemisphere import DirectionSet
 
 
@@ -91,7 +92,7 @@ class EigenBtf:
         wo: Float[Tensor, "*batch 3"],
         seen: Footprint | None = None,
     ) -> Float[Tensor, "*batch 3"]:
-        """Return T(uv, wi, wo), linear RGB: 4 lights x 4 texels of E, 4 views of W; C0, differentiable.
+        """Return T(uv, wi, wo), linear RGB: 4 lights x 4 texels of E, 4 fine views of W; C0, differentiable.
 
         Args:
             uv: (..., 2) texture coordinates, unbounded.
@@ -131,8 +132,8 @@ class EigenBtf:
         return self._weighted(pyramid.average(look_up, uv, seen, *self._size, most=1), wo)
 
     def view_weights(self, wo: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch rank"]:
-        """Return W(wo), interpolated."""
-        view = hemisphere.interpolate(self.views, wo)
+        """Return W(wo), interpolated on a finer set than was measured."""
+        view = hemisphere.interpolate(self.fine_weights[0], wo)
         return (self._weight_nodes.to(wo.dtype)[view.node] * view.weight.unsqueeze(-1)).sum(-2)
 
     def decoded(self) -> Float[Tensor, "light H W rank 3"]:
@@ -158,8 +159,15 @@ class EigenBtf:
         return [hemisphere.with_pole(maps, self.lights).flatten(0, 2).contiguous() for maps in self.levels]
 
     @cached_property
+    def fine_weights(self) -> tuple[DirectionSet, Float[Tensor, "view rank"]]:
+        """W on a finer set of views, of which linear interpolation is nearer to views that were not measured."""
+        views, weights = kriging.finer(self.views)
+        return views, (weights @ self.weights.double()).to(self.weights.dtype)
+
+    @cached_property
     def _weight_nodes(self) -> Tensor:
-        return hemisphere.with_pole(self.weights, self.views)
+        views, weights = self.fine_weights
+        return hemisphere.with_pole(weights, views)
 
     @cached_property
     def ambient_maps(self) -> list[Float[Tensor, "_ _ rank 3"]]:

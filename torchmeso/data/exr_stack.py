@@ -62,9 +62,10 @@ def survey(folder: str | Path) -> PictureSet:
     sizes = {}
     for name in angles:
         path = folder / name
-        if not path.resolve().is_relative_to(folder.resolve()) or not path.is_file():
-            raise FormatError(f"{folder / TABLE}: names the picture '{name}', of which there is none in the folder")
-        sizes[name] = [path.stat().st_size, path.stat().st_mtime_ns]
+        with store.reading(folder / TABLE):  # names may hold what no path can
+            if not path.resolve().is_relative_to(folder.resolve()) or not path.is_file():
+                raise FormatError(f"{folder / TABLE}: names the picture '{name}', of which there is none in the folder")
+            sizes[name] = [path.stat().st_size, path.stat().st_mtime_ns]
     lights = gaps.meant({light for light, _ in angles.values()}, f"{folder}: lights")
     views = gaps.meant({view for _, view in angles.values()}, f"{folder}: views")
 

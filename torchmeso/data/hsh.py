@@ -24,7 +24,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from torchmeso.data import address, image, store
+from torchmeso.data import address, image, rti, store
 from torchmeso.errors import FormatError, ShapeError, check_finite, check_shape
 
 TERMS = (4, 9, 16)
@@ -57,7 +57,7 @@ class Hsh:
             check_finite(f"hsh.{name}", values)
 
     def evaluate(self, uv: Float[Tensor, "*batch 2"], wi: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-        """Return T(uv, wi), linear RGB, seen from above; 0 for wi below the horizon.
+        """Return T(uv, wi), linear RGB, seen from above; it fades to 0 over the last degrees above the horizon.
 
         Coefficients, which are linear, are interpolated between texels.
         """
@@ -65,7 +65,7 @@ class Hsh:
         codes = (self.codes.flatten(0, 1)[taps.texel].to(uv.dtype) * taps.weight[..., None, None]).sum(-3)
         coefficients = codes / 255 * self.scale.to(uv.dtype) + self.bias.to(uv.dtype)
         srgb = (coefficients * basis(wi, self.codes.shape[-1]).unsqueeze(-2)).sum(-1)
-        return image.to_linear(srgb.clamp(min=0)) * (wi[..., 2:] > 0)
+        return image.to_linear(srgb.clamp(min=0)) * rti.fade(wi)
 
 
 def basis(wi: Float[Tensor, "*batch 3"], terms: int) -> Float[Tensor, "*batch term"]:

@@ -1,4 +1,4 @@
-"""Pictures on disk: PNG and JPEG (sRGB), OpenEXR and Radiance (linear), as linear RGB float tensors, row 0 on top.
+"""Pictures on disk: PNG, JPEG, TIFF (sRGB), OpenEXR and Radiance (linear), as linear RGB float tensors, row 0 on top.
 
 Test: tests/data/test_image.py
 """
@@ -6,6 +6,7 @@ Test: tests/data/test_image.py
 import io
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,7 +25,7 @@ EXR_PIXELS_PER_BYTE = 1032
 
 
 def read(path: str | Path | bytes) -> Float[Tensor, "H W 3"]:
-    """Return a colour picture as linear RGB; PNG and JPEG are taken as sRGB, EXR and Radiance (.hdr) as linear.
+    """Return a colour picture as linear RGB; PNG, JPEG and TIFF are taken as sRGB, EXR and Radiance (.hdr) as linear.
 
     Args:
         path: of the file; or the content of a PNG or JPEG file.
@@ -36,24 +37,40 @@ def read(path: str | Path | bytes) -> Float[Tensor, "H W 3"]:
         return _read_exr(Path(path))
     if not isinstance(path, bytes) and Path(path).suffix.lower() == ".hdr":
         return torch.from_numpy(rgbe.read(path))
-    return to_linear(torch.from_numpy(_read_pillow(path, "RGB").astype(np.float32) / 255))
+    return decode_codes(torch.from_numpy(_read_pillow(path, colour=True)))
 
 
 def read_codes(data: bytes, name: str) -> UInt8[Tensor, "H W 3"]:
-    """Return the sRGB codes of a PNG or JPEG file, given its content; nothing is decoded before its size is checked.
+    """Return the sRGB codes of a PNG, JPEG or TIFF file, given its content.
+
+    Nothing is decoded before its size is checked; 16 bits are rounded to 8.
 
     Raises:
-        FormatError: the content is damaged, or far too short for the picture it announces.
+        FormatError: the content is damaged, far too short for the picture it announces, or no whole numbers.
     """
     from PIL import Image
 
-    with store.reading(name), Image.open(io.BytesIO(data), formats=("JPEG", "PNG")) as picture:
-        width, height = picture.size
-        if width * height > PIXELS_PER_BYTE * len(data):
-            raise FormatError(
-                f"{name}: announces {width} x {height} pixels, too many for {len(data)} bytes; the copy may be damaged"
-            )
-        return torch.from_numpy(np.array(picture.convert("RGB")))
+    with store.reading(name), Image.open(io.BytesIO(data), formats=("JPEG", "PNG", "TIFF")) as picture:
+        _check_announced(picture, name, len(data))
+        return torch.from_numpy(_codes(picture, name))
+
+
+def _check_announced(picture: Any, name: object, n_bytes: int) -> None:
+    width, height = picture.size
+    if width * height > PIXELS_PER_BYTE * n_bytes:
+        raise FormatError(
+            f"{name}: announces {width} x {height} pixels, too many for {n_bytes} bytes; the copy may be damaged"
+        )
+
+
+def _codes(picture: Any, name: object) -> np.ndarray:
+    """Return (H, W, 3) uint8. Pillow itself cuts one channel of 16 bits off at 255."""
+    if picture.mode == "F":
+        raise FormatError(f"{name}: expected whole numbers of 8 or 16 bits, got floats; save such pictures as EXR")
+    if picture.mode.startswith("I"):
+        grey = np.asarray(picture).clip(0, 65535) / 257
+        return np.repeat((grey + 0.5).astype(np.uint8)[..., None], 3, axis=-1)
+    return np.array(picture.convert("RGB"))
 
 
 def read_data(path: str | Path) -> Float[Tensor, "H W"]:
@@ -64,10 +81,11 @@ def read_data(path: str | Path) -> Float[Tensor, "H W"]:
     """
     if Path(path).suffix.lower() == ".exr":
         return _read_exr(Path(path))[..., 0]
-    grey = _read_pillow(path, None)
+    grey = _read_pillow(path, colour=False)
     if grey.ndim == 3:
         grey = grey[..., 0]
-    return torch.from_numpy(grey.astype(np.float32) / (65535 if grey.dtype in (np.uint16, np.int32) else 255))
+    whole = {np.dtype(np.uint16): 65535, np.dtype(np.int32): 65535, np.dtype(np.float32): 1}.get(grey.dtype, 255)
+    return torch.from_numpy(grey.astype(np.float32) / whole)
 
 
 def read_vectors(path: str | Path | bytes) -> Float[Tensor, "H W 3"]:
@@ -81,7 +99,7 @@ def read_vectors(path: str | Path | bytes) -> Float[Tensor, "H W 3"]:
     """
     if not isinstance(path, bytes) and Path(path).suffix.lower() == ".exr":
         return _read_exr(Path(path))
-    return torch.from_numpy(_read_pillow(path, "RGB").astype(np.float32) / 255)
+    return torch.from_numpy(_read_pillow(path, colour=True).astype(np.float32) / 255)
 
 
 def write_png(path: str | Path, rgb: Float[Tensor, "H W 3"]) -> None:
@@ -144,7 +162,8 @@ def to_srgb(linear: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     return torch.where(linear <= 0.0031308, linear * 12.92, 1.055 * linear.clamp(min=0) ** (1 / 2.4) - 0.055)
 
 
-def _read_pillow(path: str | Path | bytes, mode: str | None) -> np.ndarray:
+def _read_pillow(path: str | Path | bytes, *, colour: bool) -> np.ndarray:
+    """Return (H, W, 3) codes, or the values of a picture that holds data as they are stored."""
     from PIL import Image, UnidentifiedImageError
 
     name = "embedded picture" if isinstance(path, bytes) else path
@@ -152,10 +171,11 @@ def _read_pillow(path: str | Path | bytes, mode: str | None) -> np.ndarray:
         raise FormatError(f"{path}: expected a picture, found none; check the path")
     try:
         with Image.open(io.BytesIO(path) if isinstance(path, bytes) else path) as picture:
-            return np.asarray(picture.convert(mode) if mode else picture)
-    except (UnidentifiedImageError, OSError, SyntaxError) as error:
+            _check_announced(picture, name, len(path) if isinstance(path, bytes) else Path(path).stat().st_size)
+            return _codes(picture, name) if colour else np.asarray(picture)
+    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError) as error:
         raise FormatError(
-            f"{name}: expected a PNG, JPEG or EXR picture ({error}); the copy may be incomplete"
+            f"{name}: expected a PNG, JPEG, TIFF or EXR picture ({error}); the copy may be incomplete"
         ) from error
 
 

@@ -25,7 +25,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from torchmeso.data import address, image, store
+from torchmeso.data import address, image, rti, store
 from torchmeso.errors import FormatError, check_finite, check_shape
 
 NUMBER = rb"[-+]?[\d.]{1,30}(?:[eE][-+]?\d{1,4})?"
@@ -61,7 +61,7 @@ class Ptm:
             check_finite(f"ptm.{name}", values)
 
     def evaluate(self, uv: Float[Tensor, "*batch 2"], wi: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-        """Return T(uv, wi), linear RGB, seen from above; 0 for wi below the horizon.
+        """Return T(uv, wi), linear RGB, seen from above; it fades to 0 over the last degrees above the horizon.
 
         Coefficients, which are linear, are interpolated between texels.
         """
@@ -71,7 +71,7 @@ class Ptm:
         srgb = (a * basis(wi).unsqueeze(-2)).sum(-1) / 255
         if self.colour is not None:
             srgb = srgb * _interpolate(self.colour.flatten(0, 1), taps) / 255
-        return image.to_linear(srgb.clamp(min=0)) * (wi[..., 2:] > 0)
+        return image.to_linear(srgb.clamp(min=0)) * rti.fade(wi)
 
 
 def basis(wi: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 6"]:

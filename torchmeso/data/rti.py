@@ -8,6 +8,7 @@ Lights need not stand on rings, so these sets are no `Btf`; `compress.rti` fits 
 Test: tests/data/test_rti.py
 """
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,13 +21,16 @@ from torchmeso.data import image, store
 from torchmeso.errors import FormatError, ShapeError, check_shape
 from torchmeso.geometry.directions import normalize
 
+FADE_DEG = 2.0
+"""Above the horizon: no dome has lights so low, and T is 0 at the horizon itself."""
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LightSet:
     """Pictures of one view under several lights.
 
     Attributes:
-        files: a picture per light, JPEG or PNG.
+        files: a picture per light: JPEG, PNG or TIFF.
         directions: (light, 3) unit, towards the light.
     """
 
@@ -56,6 +60,11 @@ class LightSet:
                     f"got {picture.shape[1]} x {picture.shape[0]}"
                 )
             yield picture
+
+
+def fade(wi: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 1"]:
+    """Return the factor of a fitted map near the horizon, where its polynomials do not end at 0: C0, 0 below it."""
+    return (wi[..., 2:] / math.sin(math.radians(FADE_DEG))).clamp(0, 1)
 
 
 def read(path: str | Path) -> LightSet:

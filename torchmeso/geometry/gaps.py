@@ -1,32 +1,27 @@
 """What a measured set of directions lacks: the rings it was meant to have, and weights that fill its gaps.
 
 Measured sets name their directions by angles in degrees. `meant` finds the rings behind them, `locate` the place of
-each, and `filling` weighs those present for each one missing: a membrane, the solution of Laplace's equation on
-(theta, phi), whose value at a missing direction follows from its neighbours on the ring and on the rings inside and
-outside, with missing neighbours solved for at the same time. It keeps what is present, gives constants back, and
-spans whole missing rings.
+each, and `filling` weighs those present for each one missing (`geometry.kriging`), also over whole missing rings.
 
 Test: tests/geometry/test_gaps.py
 """
 
 import math
 from collections.abc import Collection, Sequence
-from itertools import accumulate
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchmeso.errors import FormatError
-from torchmeso.geometry import hemisphere
-from torchmeso.geometry.directions import from_angles, to_angles
+from torchmeso.geometry import hemisphere, kriging, rings
 from torchmeso.geometry.hemisphere import DirectionSet
 
 Angles = tuple[float, float]
 """theta and phi in degrees."""
 
-TOLERANCE_DEG = 0.6
-"""Names round angles to whole degrees."""
+TOLERANCE_DEG = 0.75
+"""Names round both angles to whole degrees: up to 0.71 degrees between directions."""
 
 MOST = 4096
 """Directions of a set that is told from angles: rigs take some hundred, damaged names could mean millions."""
@@ -60,10 +55,10 @@ def meant(angles: Collection[Angles], name: str) -> DirectionSet:
     if not any(place is None for place in locate(hemisphere.ubo81(), angles)):
         return hemisphere.ubo81()
     thetas = sorted({theta for theta, _ in angles})
-    rings = [_ring(sorted(phi for t, phi in angles if t == theta), theta, name) for theta in thetas]
-    if sum(count for count, _ in rings) > MOST:
+    found = [_ring(sorted(phi for t, phi in angles if t == theta), theta, name) for theta in thetas]
+    if sum(count for count, _ in found) > MOST:
         raise FormatError(f"{name}: expected at most {MOST} directions on rings, got steps of a fraction of a degree")
-    return hemisphere.from_rings(thetas, *zip(*rings, strict=True))
+    return hemisphere.from_rings(thetas, *zip(*found, strict=True))
 
 
 def _ring(phis: Sequence[float], theta: float, name: str) -> tuple[int, float]:
@@ -72,27 +67,22 @@ def _ring(phis: Sequence[float], theta: float, name: str) -> tuple[int, float]:
         return 1, phis[0]
     step = min((b - a) % 360 for a, b in zip(phis, [*phis[1:], phis[0]], strict=True))
     count = round(360 / step)
-    off = [abs((phi - phis[0]) * count / 360 - round((phi - phis[0]) * count / 360)) * 360 / count for phi in phis]
-    if max(off) > TOLERANCE_DEG:
+    first = rings.first_azimuth(torch.tensor(phis, dtype=torch.float64), count)
+    steps = [(phi - first) * count / 360 for phi in phis]
+    if max(abs(x - round(x)) * 360 / count for x in steps) > TOLERANCE_DEG:
         raise FormatError(
             f"{name}: expected even steps in azimuth at theta {theta:g}, got {', '.join(f'{p:g}' for p in phis[:6])}; "
             "only directions on rings can be read"
         )
-    return count, phis[0] % (360 / count)
+    return count, first
 
 
 def locate(directions: DirectionSet, angles: Collection[Angles]) -> list[int | None]:
     """Return the index of each of `angles` (degrees) in the set, None where it has none there."""
-    firsts = [0, *accumulate(directions.count)]
-    places: list[int | None] = []
-    for theta, phi in angles:
-        k = min(range(len(directions.count)), key=lambda ring: abs(theta - directions.theta_deg[ring]))
-        ring, count, phi0 = directions.theta_deg[k], directions.count[k], directions.phi0_deg[k]
-        j = round((phi - phi0) * count / 360)
-        off = abs(phi - phi0 - 360 * j / count) if ring > 0 else 0.0
-        there = abs(theta - ring) <= TOLERANCE_DEG and off <= TOLERANCE_DEG
-        places.append(firsts[k] + j % count if there else None)
-    return places
+    if not angles:
+        return []
+    places, off = rings.nearest(directions, torch.tensor(list(angles), dtype=torch.float64))
+    return [p if away <= TOLERANCE_DEG else None for p, away in zip(places.tolist(), off.tolist(), strict=True)]
 
 
 def turned(angles: Angles) -> Angles:
@@ -116,46 +106,13 @@ def filling(directions: DirectionSet, present: Bool[Tensor, "direction"]) -> Flo
     Rows sum to 1; columns of missing directions are 0. At least one direction must be present.
     """
     n = len(directions)
-    stencil = torch.zeros(n, n, dtype=torch.float64)
-    for i in (~present).nonzero()[:, 0].tolist():
-        stencil[i] = _neighbours(directions, i)
-    missing = ~present
     weights = torch.eye(n, dtype=torch.float64) * present
+    missing = ~present
     if bool(missing.any()):
-        system = torch.eye(int(missing.sum()), dtype=torch.float64) - stencil[missing][:, missing]
-        filled = torch.linalg.solve(system, stencil[missing][:, present])
-        filled = torch.where(filled < SMALL, 0, filled)
+        w = directions.directions(torch.float64)
+        filled = kriging.weights(w[present], w[missing])
+        filled = torch.where(filled.abs() < SMALL, 0, filled)
         rows = torch.zeros(len(filled), n, dtype=torch.float64)
         rows[:, present] = filled / filled.sum(1, keepdim=True)
         weights[missing] = rows
     return weights
-
-
-def _neighbours(directions: DirectionSet, i: int) -> Float[Tensor, "direction"]:
-    """Return the shares of a direction's neighbours: on its ring, and where its azimuth meets the next rings."""
-    shares = torch.zeros(directions.n_nodes, dtype=torch.float64)
-    last = torch.tensor(directions.count).cumsum(0)
-    k = int(torch.searchsorted(last, i, right=True))
-    theta, count = (math.radians(directions.theta_deg[k]), directions.count[k])
-    first = int(last[k]) - count
-    phi = to_angles(directions.directions(torch.float64)[i])[1]
-    gaps = {
-        ring: abs(math.radians(directions.theta_deg[ring]) - theta)
-        for ring in (k - 1, k + 1)
-        if 0 <= ring < len(directions.count)
-    }
-    for ring, gap in gaps.items():
-        share = 2 / (gap * sum(gaps.values()))  # the second difference over uneven steps
-        if theta == 0:  # the pole sees the whole ring
-            start = int(last[ring]) - directions.count[ring]
-            shares[start : int(last[ring])] += share / directions.count[ring]
-        else:
-            other = torch.tensor(math.radians(directions.theta_deg[ring]), dtype=torch.float64)
-            taps = hemisphere.interpolate(directions, from_angles(other, phi))
-            shares.index_add_(0, taps.node, share * taps.weight)
-    if count > 1:
-        step = math.sin(theta) * 2 * math.pi / count
-        for j in (i - 1, i + 1):
-            shares[first + (j - first) % count] += 1 / step**2
-    shares = shares[: len(directions)]  # a pole that is no direction of the set cannot be asked for: theta > 0 here
-    return shares / shares.sum()

@@ -82,26 +82,43 @@ def _fitted(theta: Tensor, phi: Tensor) -> DirectionSet:
         if count == 1 and mean < TOLERANCE_DEG:
             rings.append((0.0, 1, 0.0))
             continue
-        turns = torch.exp(1j * phi[group].deg2rad() * count).mean()
-        first = math.degrees(math.atan2(float(turns.imag), float(turns.real))) / count
-        # float32 radians are good to 1e-5 degrees; what is meant is a short number.
-        rings.append((round(mean, 4), count, round(first % (360 / count), 4) % (360 / count)))
+        rings.append((round(mean, 4), count, first_azimuth(phi[group], count)))
     return hemisphere.from_rings(*zip(*rings, strict=True))
+
+
+def first_azimuth(phi_deg: Float[Tensor, "direction"], count: int) -> float:
+    """Return the azimuth, in degrees, of the first of `count` even steps that fit the azimuths best.
+
+    It is rounded to 4 digits: float32 radians are good to 1e-5 degrees, and what is meant is a short number.
+    """
+    turns = torch.exp(1j * phi_deg.double().deg2rad() * count).mean()
+    first = math.degrees(math.atan2(float(turns.imag), float(turns.real))) / count
+    return round(first % (360 / count), 4) % (360 / count)
+
+
+def nearest(
+    directions: DirectionSet, angles_deg: Float[Tensor, "direction 2"]
+) -> tuple[Int[Tensor, "direction"], Float[Tensor, "direction"]]:
+    """Return the place in the set that is nearest to each theta and phi (degrees) on the nearest ring.
+
+    Returns:
+        (n) places, and (n) degrees between the directions there and those asked for.
+    """
+    theta, phi = angles_deg.double().unbind(-1)
+    ring_theta = torch.tensor(directions.theta_deg, dtype=torch.float64)
+    count, phi0 = torch.tensor(directions.count), torch.tensor(directions.phi0_deg, dtype=torch.float64)
+    ring = (theta[:, None] - ring_theta).abs().argmin(1)
+    step = ((phi - phi0[ring]) * count[ring] / 360).round().long() % count[ring]
+    place = torch.tensor([0, *accumulate(directions.count)])[ring] + step
+    apart = (from_angles(theta.deg2rad(), phi.deg2rad()) - directions.directions(torch.float64)[place]).norm(dim=-1)
+    return place, 2 * (apart / 2).clamp(max=1).asin().rad2deg()
 
 
 def _places(directions: DirectionSet, theta: Tensor, phi: Tensor) -> Tensor | None:
     """Return the order that sorts a list into `directions`; None unless each has exactly one near its place."""
     if len(directions) != len(theta):
         return None
-    ring_theta = torch.tensor(directions.theta_deg, dtype=torch.float64)
-    count, phi0 = torch.tensor(directions.count), torch.tensor(directions.phi0_deg, dtype=torch.float64)
-    ring = (theta[:, None] - ring_theta).abs().argmin(1)
-    step = ((phi - phi0[ring]) * count[ring] / 360).round().long() % count[ring]
-    place = torch.tensor([0, *accumulate(directions.count)])[ring] + step
-    if len(place.unique()) < len(place):
-        return None
-    meant = directions.directions(torch.float64)[place]
-    listed = from_angles(theta.deg2rad(), phi.deg2rad())
-    if float((listed - meant).norm(dim=-1).max()) > math.radians(TOLERANCE_DEG):
+    place, off = nearest(directions, torch.stack([theta, phi], -1))
+    if len(place.unique()) < len(place) or float(off.max()) > TOLERANCE_DEG:
         return None
     return place.argsort()

@@ -41,7 +41,7 @@ def file(path: str | Path) -> dict[str, Any]:
         return _rti(path)
     if name.endswith((".yaml", ".yml")):
         return _config(path)
-    if name.endswith((".png", ".jpg", ".jpeg", ".exr", ".hdr")):
+    if name.endswith((".png", ".jpg", ".jpeg", ".tif", ".tiff", ".exr", ".hdr")):
         rgb = image.read(path)
         return {"kind": "picture", "size": f"{rgb.shape[1]} x {rgb.shape[0]}", "largest value": float(rgb.max())}
     if name.endswith((".obj", ".ply", ".glb", ".gltf", ".off", ".stl")):

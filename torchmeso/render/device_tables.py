@@ -223,14 +223,15 @@ def _reflectance(pool: "_Pool", btf: EigenBtf, *, ambient: bool) -> np.ndarray:
     codes = btf.maps.dtype == torch.uint8
     height, width = btf.texels
     maps = [hemisphere.with_pole(x if codes else x.float(), btf.lights).flatten(0, 2) for x in btf.levels]
-    weights = hemisphere.with_pole(btf.weights.float(), btf.views)
+    views, fine = btf.fine_weights
+    weights = hemisphere.with_pole(fine.float(), views)
     scale, offset = _grouped(btf.scale.float()[None])[0], _grouped(btf.offset.float()[None])[0]
     by_channel = _grouped(weights[:, :, None].expand(-1, -1, 3))
     by_channel[:, :, 3] = _bounds(btf, weights)
     record["there"], record["height"], record["width"], record["groups"] = EIGEN, height, width, groups
     record["codes"] = codes
     record["light_rings"], record["light_count"] = pool.add(_rings(btf.lights)), _ring_count(btf.lights)
-    record["view_rings"], record["view_count"] = pool.add(_rings(btf.views)), _ring_count(btf.views)
+    record["view_rings"], record["view_count"] = pool.add(_rings(views)), _ring_count(views)
     record["maps"] = pool.add(_grouped(torch.cat(maps)).numpy())
     record["levels"], record["level_count"] = pool.add(_level_records(btf, [len(x) for x in maps])), len(maps)
     record["weights"], record["scale"], record["offset"] = (pool.add(x.numpy()) for x in (by_channel, scale, offset))
