@@ -172,9 +172,10 @@ def compress(
     **options: Any,
 ) -> None:
     """Compress a BTF TABLE (.btf.zarr or .btf, or a folder or zip of pictures) into a run-time model."""
-    from torchmeso.compress import double_sh, eigen
-    from torchmeso.data import eigen_btf, mdf, sh_btf
+    from torchmeso.compress import double_sh, eigen, stream
+    from torchmeso.data import journal, mdf
     from torchmeso.pipeline import picture_sets
+    from torchmeso.pipeline.bake import code_hash
 
     if not out.endswith(".meso"):
         raise ConfigError(f"{out}: expected a name that ends in .meso")
@@ -190,11 +191,8 @@ def compress(
     chosen = kind(**given)
     with _progress() as report:
         source = picture_sets.open_btf(table, report, allow_missing=allow_missing)
-        told = partial(report, f"{method} BTF")
-        if isinstance(chosen, eigen.EigenOptions):
-            eigen_btf.save(eigen.fit(source, chosen, progress=told), out, silhouette=depth)
-        else:
-            sh_btf.save(double_sh.fit(source, chosen, backend="auto", progress=told), out, silhouette=depth)
+        key = f"{journal.state_of(table)} {code_hash()}"
+        stream.fit(source, chosen, out, key=key, silhouette=depth, progress=partial(report, f"{method} BTF"))
     click.echo(out)
 
 

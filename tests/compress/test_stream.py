@@ -81,20 +81,21 @@ def test_a_fit_that_was_killed_goes_on(name, calls, table, tmp_path, monkeypatch
     assert (tmp_path / "a.meso").read_bytes() == (tmp_path / "b.meso").read_bytes()
 
 
-def test_another_job_is_not_gone_on_with(table, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    "other", [{"key": "other"}, {"options": DoubleShOptions(light_terms=9, view_terms=4, energy=2.0)}], ids=str
+)
+def test_another_job_is_not_gone_on_with(other, table, tmp_path, monkeypatch):
     def dies(share):
         raise Killed
 
-    for other in ({"key": "other"}, {"options": DoubleShOptions(light_terms=9, view_terms=4, energy=2.0)}):
-        job = {"key": "k", "options": OPTIONS["double-sh"], **other}
-        with pytest.raises(Killed):
-            stream.fit(table, path=tmp_path / "a.meso", backend="torch", progress=dies, **job)
-        read = []
-        stored_rows = Btf.stored_rows
-        with monkeypatch.context() as patch:
-            patch.setattr(Btf, "stored_rows", lambda self, a, b, *c: read.append(a) or stored_rows(self, a, b, *c))
-            stream.fit(table, OPTIONS["double-sh"], tmp_path / "a.meso", key="k", backend="torch")
-        assert len(read) == 6
+    job = {"key": "k", "options": OPTIONS["double-sh"], "path": tmp_path / "a.meso", "backend": "torch"}
+    with pytest.raises(Killed):
+        stream.fit(table, progress=dies, **{**job, **other})
+    read = []
+    stored_rows = Btf.stored_rows
+    monkeypatch.setattr(Btf, "stored_rows", lambda self, a, b, *c: read.append(a) or stored_rows(self, a, b, *c))
+    stream.fit(table, **job)
+    assert len(read) == 6
 
 
 def test_progress_reaches_one(table, tmp_path):

@@ -29,9 +29,9 @@ def test_another_job_begins_anew(tmp_path):
 
 @pytest.mark.errors
 def test_what_cannot_be_read_or_written_is_told(tmp_path):
-    with pytest.raises(FormatError, match="expected 3 numbers, got 2; remove it"):
-        with journal.beside(tmp_path / "a.meso", "one") as kept:
-            kept.write("x", torch.zeros(2))
+    with journal.beside(tmp_path / "a.meso", "one") as kept:
+        kept.write("x", torch.zeros(2))
+        with pytest.raises(FormatError, match="expected 3 numbers, got 2; remove it"):
             kept.read("x", (3,), torch.float32)
     (tmp_path / "file").touch()
     with pytest.raises(StorageError, match="could not be written"), journal.beside(tmp_path / "file" / "b.meso", "one"):

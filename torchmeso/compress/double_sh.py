@@ -11,7 +11,8 @@ the energy of what it stands for over the hemisphere, omega_j the solid angle th
 hemisphere shows, which suppresses the large, opposed coefficients that cancel there and amplify noise.
 
 Columns (texels and channels) do not see each other: bands of texel rows of any height give the same bits. The table is
-read in bands (`data.bands`), its sRGB codes go to the kernel as they are. Before they are quantised the coefficients are kept in float16, whose step is far below that of uint8.
+read in bands (`data.bands`), and its sRGB codes go to the kernel as they are. Before they are quantised the
+coefficients are kept in float16, whose step is far below that of uint8.
 
 Kernel: kernels_cl/compress/double_sh.cl          Test: tests/compress/test_double_sh.py
 """
@@ -223,10 +224,8 @@ def project(
         return _project_opencl(samples, light, view, unit, srgb)
     found = []
     for part in samples.split(COLUMNS, 2):
-        if srgb:
-            values = image.decode_codes(part)
-        else:
-            values = (part if part.is_floating_point() else part.float()) * unit
+        floats = part if part.is_floating_point() else part.float()
+        values = image.decode_codes(part) if srgb else floats * unit
         found.append(_stage(_stage(values, light).movedim(1, 0), view).movedim(1, 0))
     return torch.cat(found, 2)
 

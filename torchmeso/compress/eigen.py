@@ -55,7 +55,8 @@ def fit(btf: Bands, options: EigenOptions | None = None, *, progress: Progress =
     height, width = btf.texels
     layout = bands.layout(btf)
     total = torch.zeros(n_view, n_view, dtype=torch.float64)
-    for rows, total in grams(btf, layout, total):
+    for rows, sum_so_far in grams(btf, layout, total):
+        total = sum_so_far
         progress(0.5 * rows.stop / height)
     W = right_basis(total, options.rank).vectors.float()
     maps = torch.empty(len(btf.lights), height, width, options.rank, 3)

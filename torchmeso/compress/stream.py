@@ -123,7 +123,8 @@ def _fit_eigen(
     for at, rows in enumerate(layout):
         if kept.has(_name("gram", rows), square, torch.float64):
             total, todo = kept.read(_name("gram", rows), square, torch.float64), layout[at + 1 :]
-    for rows, total in eigen.grams(btf, todo, total):
+    for rows, sum_so_far in eigen.grams(btf, todo, total):
+        total = sum_so_far
         kept.write(_name("gram", rows), total)
         progress(0.4 * rows.stop / height)
     W = right_basis(total, options.rank).vectors.float()

@@ -217,7 +217,7 @@ def write(
     layout: dict[str, tuple[torch.dtype, tuple[int, ...]]] = {
         f"eigen.map.{k}": (dtype, (len(lights), *texels, 3)) for k in range(rank)
     }
-    layout |= {name: (torch.float32, (rank, 3)) for name in ("eigen.scale", "eigen.offset")}
+    layout |= dict.fromkeys(("eigen.scale", "eigen.offset"), (torch.float32, (rank, 3)))
     whole = {"eigen.weights": weights}
     parts = _meta(lights, views, rank, {})
     if silhouette is not None:

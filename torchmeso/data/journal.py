@@ -40,8 +40,8 @@ class Journal:
             StorageError: the disk is full, or the place cannot be written to.
         """
         beside = self.folder / f"{name}.partial"
-        with store.writing(self.folder):
-            values.contiguous().numpy().tofile(beside)
+        with store.writing(self.folder.with_suffix("")):
+            beside.write_bytes(memoryview(values.contiguous().numpy()))
             os.replace(beside, self.folder / name)
 
     def read(
@@ -55,7 +55,8 @@ class Journal:
         count = shape[0] - first if count is None else count
         inner = math.prod(shape[1:])
         kind = torch.empty(0, dtype=dtype).numpy().dtype
-        found = np.fromfile(self.folder / name, kind, count * inner, offset=first * inner * dtype.itemsize)
+        with store.reading(self.folder / name):
+            found = np.fromfile(self.folder / name, kind, count * inner, offset=first * inner * dtype.itemsize)
         if len(found) != count * inner:
             raise FormatError(f"{self.folder / name}: expected {count * inner} numbers, got {len(found)}; remove it")
         return torch.from_numpy(found).reshape(count, *shape[1:])

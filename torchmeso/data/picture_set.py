@@ -22,7 +22,7 @@ import torch
 from jaxtyping import Bool, Shaped
 from torch import Tensor
 
-from torchmeso.data import btf, image, store
+from torchmeso.data import bands, btf, image, store
 from torchmeso.data.btf import Btf, Encoding
 from torchmeso.errors import FormatError, check_memory
 from torchmeso.geometry import gaps
@@ -41,7 +41,7 @@ AHEAD = 8
 """Pictures being decoded while others are written."""
 
 ROWS = 16
-"""Rows of texels in a chunk: fits read bands of them, over all lights."""
+"""Rows of texels in a chunk, at most: fits read bands of them, over all lights and views (`bands.ROOM`)."""
 
 SHARD_BYTES = 128 << 20
 """About what is encoded at once."""
@@ -205,7 +205,8 @@ def _specs(shape: tuple[int, ...], encoding: Encoding) -> dict[str, store.ArrayS
     """Return the layout for fits, which read bands of rows over all lights."""
     light, _, height, width, _ = shape
     dtype, size = ("uint8", 1) if encoding == "srgb" else ("float32", 4)
-    spec = btf.specs(shape, dtype, chunk=(light, 1, ROWS, width, 3))["images"]
+    fitting = max(1, min(ROWS, bands.ROOM // (light * shape[1] * width * 3 * size)))
+    spec = btf.specs(shape, dtype, chunk=(light, 1, fitting, width, 3))["images"]
     chunk_rows = spec.chunks[2]
     rows = chunk_rows * max(1, SHARD_BYTES // (light * chunk_rows * width * 3 * size))
     return {"images": replace(spec, shards=(light, 1, min(rows, -(-height // chunk_rows) * chunk_rows), width, 3))}

@@ -238,7 +238,7 @@ def write(
         for a in range(len(bands(terms[0])))
         for b in range(len(bands(terms[1])))
     }
-    layout |= {name: (torch.float32, (*terms, 3)) for name in ("sh.scale", "sh.offset")}
+    layout |= dict.fromkeys(("sh.scale", "sh.offset"), (torch.float32, (*terms, 3)))
     parts = _meta(lights, views, terms, {})
     depth: dict[str, Tensor] = {}
     if silhouette is not None:
