@@ -19,7 +19,7 @@ def codes(rng):
 def as_table(codes, path):
     """Write codes as tables of pictures are: chunks of all lights and 16 rows."""
     attributes = btf.table_attributes(LIGHTS, VIEWS, 0.0, "srgb")
-    writer = store.open_blocks(path, picture_set._specs(tuple(codes.shape), "srgb"), attributes)
+    writer = store.open_blocks(path, picture_set.specs(tuple(codes.shape), "srgb"), attributes)
     writer["images"][:] = codes.numpy()
     writer.finish()
     return btf.load(path)

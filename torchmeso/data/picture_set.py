@@ -173,7 +173,7 @@ def to_table(
             **attributes,
         }
         with store.writing(path):
-            writer = store.open_blocks(path, _specs(shape, pictures.encoding), attributes)
+            writer = store.open_blocks(path, specs(shape, pictures.encoding), attributes)
             table = writer["images"]
             todo = [v for v in range(n_view) if not writer.is_done(v)]
             for v, block in _blocks(pictures, reader, shape, todo):
@@ -201,7 +201,7 @@ def _shape(pictures: PictureSet, reader: Reader, allow_missing: bool) -> tuple[i
     return len(pictures.lights), len(pictures.views), height, width, 3
 
 
-def _specs(shape: tuple[int, ...], encoding: Encoding) -> dict[str, store.ArraySpec]:
+def specs(shape: tuple[int, ...], encoding: Encoding) -> dict[str, store.ArraySpec]:
     """Return the layout for fits, which read bands of rows over all lights."""
     light, _, height, width, _ = shape
     dtype, size = ("uint8", 1) if encoding == "srgb" else ("float32", 4)
