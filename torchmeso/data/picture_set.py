@@ -228,7 +228,7 @@ def _blocks(
         for l in present.nonzero()[:, 0].tolist():
             picture = next(decoded)
             _check_size(pictures, pictures.files[l, v], picture, (height, width))
-            block[l] = picture
+            block.numpy()[l] = picture.numpy()  # torch would wake all its threads for each picture
         if bool(present.any()) and not bool(present.all()):
             _fill_lights(pictures, block, present)
         yield v, block
