@@ -88,7 +88,7 @@ def streamed(context: Context) -> Iterator[Row]:
                 beside = "the paper's is not at hand" if paper is None else f"paper {paper} s, {paper / run.wall:.0f}x"
                 yield _row(
                     size, terms, run.wall, goal=120 if size == 800 else None,
-                    peer=f"CPU/cores {run.cpu / 2:.1f} s; {beside}; model {100 * share:.1f} % of {raw / 1e9:.2f} GB raw "
+                    peer=f"CPU/cores {run.cpu / 2:.1f} s; {beside}; model {100 * share:.1f} % of {raw / 1e9:.2f} GB "
                     f"(paper {100 * 25 * terms / 6561:.1f} %); read {run.asked / 1e9:.2f} GB, "
                     f"{run.from_disk / 1e9:.2f} GB of it from the disk, which alone takes {alone:.1f} s",
                 )  # fmt: skip

@@ -84,10 +84,18 @@ def each_row(btf: Bands, band: Band) -> Iterator[Float[Tensor, "light view W 3"]
     Raises:
         ShapeError: a value is not finite, or too large.
     """
-    for row in range(band.stored.shape[2]):
-        stored = band.stored[:, :, row : row + 1]
-        linear = btf.linear(stored, band.rows.start + row) if isinstance(btf, Btf) else stored
-        yield linear[:, :, 0]
+    return (linear_row(btf, band, row) for row in range(band.stored.shape[2]))
+
+
+def linear_row(btf: Bands, band: Band, row: int) -> Float[Tensor, "light view W 3"]:
+    """Return T of row 0, 1, ... of a band as float32.
+
+    Raises:
+        ShapeError: a value is not finite, or too large.
+    """
+    stored = band.stored[:, :, row : row + 1]
+    linear = btf.linear(stored, band.rows.start + row) if isinstance(btf, Btf) else stored
+    return linear[:, :, 0]
 
 
 def _rooms(btf: Bands, bands: Sequence[slice]) -> list[np.ndarray | None]:
