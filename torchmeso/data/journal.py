@@ -41,7 +41,7 @@ class Journal:
         """
         beside = self.folder / f"{name}.partial"
         with store.writing(self.folder.with_suffix("")):
-            beside.write_bytes(memoryview(values.contiguous().numpy()))
+            beside.write_bytes(values.contiguous().numpy().data)
             os.replace(beside, self.folder / name)
 
     def read(

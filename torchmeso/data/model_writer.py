@@ -59,6 +59,6 @@ def in_parts(path: str | Path, layout: Layout, meta: dict[str, Any]) -> Iterator
             assert values.dtype == dtype and values.shape[1:] == shape[1:], (name, values.shape, shape)
             assert start + len(values) <= shape[0]
             file.seek(first + header[name]["data_offsets"][0] + start * math.prod(shape[1:]) * dtype.itemsize)
-            file.write(memoryview(values.contiguous().numpy()))
+            file.write(values.contiguous().numpy().data)
 
         yield write
