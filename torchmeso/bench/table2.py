@@ -97,7 +97,8 @@ def streamed(context: Context) -> Iterator[Row]:
                     size, terms, run.best, goal=120 if size == 800 else None,
                     peer=f"wall {run.wall:.1f} s, CPU/cores {run.cpu / CORES:.1f} s; {beside}; "
                     f"model {100 * share:.1f} % of {raw / 1e9:.2f} GB (paper {100 * 25 * terms / 6561:.1f} %); "
-                    f"read {run.asked / 1e9:.2f} GB, {run.from_disk / 1e9:.2f} GB of it from the disk, which alone takes {alone:.1f} s",
+                    f"read {run.asked / 1e9:.2f} GB, {run.from_disk / 1e9:.2f} GB of it from the disk, "
+                    f"which alone takes {alone:.1f} s",
                 )  # fmt: skip
                 yield Row(
                     id=f"compress.stream.{size}.{terms}.memory", what=f"largest resident memory of that fit, {size}^2",
