@@ -7,11 +7,15 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 import yaml
 
 from tests.pipeline.small import CONTENT
-from torchmeso.data import mdf
+from torchmeso.cli import main
+from torchmeso.data import btf, mdf, sh_btf, store
+from torchmeso.geometry import hemisphere
 
 GRID = "grid(4, 2, 80)"
 
@@ -29,13 +33,14 @@ def place(tmp_path, monkeypatch):
     return tmp_path
 
 
-def start(place, *arguments, limit=None) -> subprocess.Popen:
-    """Run the command line in `place`; no file may grow beyond `limit` bytes, as on a disk that is full."""
+def start(place, *arguments, limit=None, after="pass") -> subprocess.Popen:
+    """Run the command line in `place` `after` a statement; no file may grow beyond `limit` bytes: a full disk."""
 
     def confine():
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 
-    command = [sys.executable, "-m", "torchmeso", *map(str, arguments)]
+    code = f"{after}; import runpy; runpy.run_module('torchmeso', run_name='__main__', alter_sys=True)"
+    command = [sys.executable, "-c", code, *map(str, arguments)]
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
     return subprocess.Popen(
         command, cwd=place, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
@@ -157,3 +162,60 @@ def test_a_sequence_that_was_killed_goes_on(place):
     _, said = process.communicate(timeout=60)
     assert process.returncode == 130, said
     assert {n: (part / n).stat().st_mtime_ns for n in made} == made
+
+
+ROW_BY_ROW = "from torchmeso.data import bands; bands.ROOM = 1"
+
+
+@pytest.fixture
+def table(place):
+    """A raw table of 40 rows of texels that is fitted a row at a time, and how."""
+    lights, views = hemisphere.grid(6, 3, 80), hemisphere.grid(5, 3, 80)
+    shape = (18, 15, 40, 8, 3)
+    writer = store.open_blocks(
+        place / "cache" / "a.btf.zarr", btf.specs(shape, "uint8", chunk=(18, 1, 1, 8, 3)),
+        btf.table_attributes(lights, views, 0.0, "srgb"),
+    )  # fmt: skip
+    writer["images"][:] = np.random.default_rng(1).integers(0, 256, shape, np.uint8)
+    writer.finish()
+    options = ("--method", "double-sh", "--light-terms", 4, "--view-terms", 4)
+    return ("compress", place / "cache" / "a.btf.zarr", *options, "--out")
+
+
+@pytest.mark.parametrize("signal", [2, pytest.param(9, marks=pytest.mark.slow)])
+def test_a_fit_that_was_stopped_or_killed_goes_on(signal, table, place):
+    """The bands it kept are not fitted again, and the model is the one of a fit in one go."""
+    slow = f"{ROW_BY_ROW}; import time; from torchmeso.data.journal import Journal as J; w = J.write; "
+    slow += "J.write = lambda *a: (w(*a), time.sleep(0.2))[0]"
+    process = start(place, *table, "a.meso", after=slow)
+    kept = place / "a.meso.part"
+    wait_for(lambda: len(list(kept.glob("c.*[0-9]"))) >= 4)
+    process.send_signal(signal)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == (130 if signal == 2 else -9)
+    assert "Traceback" not in said
+    assert left(place) == []
+    made = [p.name for p in kept.glob("c.*[0-9]")]
+    assert 4 <= len(made) < 40
+    strict = f"{ROW_BY_ROW}; from torchmeso.data.journal import Journal as J; w = J.write; "
+    strict += f"J.write = lambda j, n, v: w(j, n, v) if n not in {made} else 1 / 0"
+    assert finish(place, *table, "a.meso", after=strict)[0] == 0
+    assert not list(place.glob("*.part"))
+    main([*map(str, table), str(place / "b.meso")], standalone_mode=False)  # in one band
+    a, b = sh_btf.load(place / "a.meso"), sh_btf.load(place / "b.meso")
+    assert torch.equal(a.maps, b.maps)
+    assert torch.equal(a.scale, b.scale)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("limit", [300, 1000, 12000])
+def test_a_fit_on_a_full_disk_is_one_sentence_and_goes_on(limit, table, place):
+    """The disk is full in the journal, and in the model; kernels would not even build there."""
+    on_torch = f"{ROW_BY_ROW}; from torchmeso.backends import opencl; opencl.resolve = lambda backend: 'torch'"
+    status, said = finish(place, *table, "a.meso", limit=limit, after=on_torch)
+    assert status == 2, said
+    assert "a.meso: could not be written (File too large); make room or choose another place" in said
+    assert "Traceback" not in said
+    assert left(place) == []
+    assert finish(place, *table, "a.meso", after=on_torch)[0] == 0
+    assert left(place, "a.meso") == []

@@ -187,9 +187,10 @@ def compress(
     **options: Any,
 ) -> None:
     """Compress a BTF TABLE (.btf.zarr or .btf, a folder or zip of pictures, or an RTI set .lp) into a small model."""
-    from torchmeso.compress import double_sh, eigen, sh_pca
-    from torchmeso.data import eigen_btf, mdf, sh_btf, sh_pca_btf
+    from torchmeso.compress import double_sh, eigen, sh_pca, stream
+    from torchmeso.data import journal, mdf
     from torchmeso.pipeline import picture_sets
+    from torchmeso.pipeline.bake import code_hash
 
     if method in ("ptm", "hsh"):
         _relight(table, method, out, force, options)
@@ -209,13 +210,8 @@ def compress(
     chosen = kind(**given)
     with _progress() as report:
         source = picture_sets.open_btf(table, report, allow_missing=allow_missing)
-        told = partial(report, f"{method} BTF")
-        if isinstance(chosen, eigen.EigenOptions):
-            eigen_btf.save(eigen.fit(source, chosen, progress=told), out, silhouette=depth)
-        elif isinstance(chosen, sh_pca.ShPcaOptions):
-            sh_pca_btf.save(sh_pca.fit(source, chosen, progress=told), out, silhouette=depth)
-        else:
-            sh_btf.save(double_sh.fit(source, chosen, backend="auto", progress=told), out, silhouette=depth)
+        key = f"{journal.state_of(table)} {code_hash()}"
+        stream.fit(source, chosen, out, key=key, silhouette=depth, progress=partial(report, f"{method} BTF"))
     click.echo(out)
 
 

@@ -3,9 +3,11 @@ import math
 import pytest
 import torch
 
+from torchmeso.algebra import secular
 from torchmeso.algebra.spherical_harmonics import basis
 from torchmeso.compress import double_sh
 from torchmeso.compress.double_sh import DoubleShOptions
+from torchmeso.data import bands, image
 from torchmeso.data.btf import Btf
 from torchmeso.errors import ConfigError, ShapeError
 from torchmeso.geometry import hemisphere
@@ -78,14 +80,49 @@ def test_opencl_reads_bytes_and_views_of_tensors(rng, device):
 def test_bands_give_the_same_bits(backend, rng, device, monkeypatch):
     btf = table(rng, 5, 7)
     whole = double_sh.fit(btf, backend=backend)
-    monkeypatch.setattr(double_sh, "BAND_BYTES", 1)
-    monkeypatch.setattr(double_sh, "COLUMNS", 16)
-    parts = double_sh.fit(btf, backend=backend)
+    monkeypatch.setattr(bands, "ROOM", 1)
     if backend == "opencl":
-        assert torch.equal(whole.maps, parts.maps)
-        assert torch.equal(whole.scale, parts.scale)
-    else:  # products of matrices are summed in other orders in other shapes
-        torch.testing.assert_close(whole.decoded(), parts.decoded(), rtol=0, atol=2e-3)  # a step of float16, or a code
+        monkeypatch.setattr(double_sh, "COLUMNS", 16)
+    parts = double_sh.fit(btf, backend=backend)
+    assert torch.equal(whole.maps, parts.maps)
+    assert torch.equal(whole.scale, parts.scale)
+
+
+def test_codes_go_to_the_kernel_as_they_are(rng, device):
+    lights, views = SETS
+    codes = torch.randint(0, 256, (81, 50, 4, 6, 3), dtype=torch.uint8, generator=rng)
+    raw = Btf(images=codes, lights=lights, views=views, encoding="srgb")
+    linear = Btf(images=raw.pictures(), lights=lights, views=views)
+    options = DoubleShOptions(light_terms=9, view_terms=9, storage="float32")
+    found, exact = double_sh.fit(raw, options, backend="opencl"), double_sh.fit(linear, options)
+    torch.testing.assert_close(found.decoded(), exact.decoded(), rtol=0, atol=1e-3)  # steps of float16
+    assert (found.decoded() - exact.decoded()).abs().mean() < 1e-5
+
+
+def test_every_code_is_decoded_by_the_kernel_as_by_the_table(device):
+    one = double_sh.Side(factors=secular.factorise(torch.ones(1, 1), "one"), share=None)
+    codes = torch.arange(256, dtype=torch.uint8)[None, None]
+    found = double_sh.project(codes, one, one, srgb=True, backend="opencl")[0, 0]
+    torch.testing.assert_close(found, image.srgb_table(), rtol=1e-5, atol=5e-7)  # measured 4.2e-7
+    torch.testing.assert_close(double_sh.project(codes, one, one, srgb=True)[0, 0], image.srgb_table())
+
+
+@pytest.mark.parametrize("masked", [0.0, 0.5, 1.0])
+def test_black_texels_are_not_fitted(masked, rng, device, monkeypatch):
+    lights, views = SETS
+    codes = torch.randint(0, 256, (81, 50, 4, 12, 3), dtype=torch.uint8, generator=rng)
+    codes[:, :, :, : round(masked * 12)] = 0
+    codes[:, 0, 0, 5] = 0  # dark from one view is not black
+    btf = Btf(images=codes, lights=lights, views=views, encoding="srgb")
+    options = DoubleShOptions(light_terms=4, view_terms=4)
+    fitted = []
+    project = double_sh.project
+    monkeypatch.setattr(double_sh, "project", lambda x, *a, **k: fitted.append(x.shape[2]) or project(x, *a, **k))
+    skipping = double_sh.fit(btf, options, backend="opencl")
+    assert sum(fitted) == round((1 - masked) * 144)
+    monkeypatch.setattr(double_sh, "LIT_SHARE", -1.0)
+    whole = double_sh.fit(btf, options, backend="opencl")
+    assert torch.equal(skipping.maps, whole.maps)
 
 
 def test_the_model_shows_the_btf(rng):

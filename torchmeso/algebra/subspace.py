@@ -10,6 +10,7 @@ Test: tests/algebra/test_subspace.py
 """
 
 from collections.abc import Callable, Iterable
+from functools import partial
 
 import torch
 from jaxtyping import Float
@@ -22,8 +23,23 @@ ROUNDS = 3
 """Turns of the iteration; each takes two passes."""
 
 
+Remember = Callable[[str, tuple[int, ...], Callable[[], Tensor]], Tensor]
+"""Called with the name and shape of what a pass gives, and the pass; returns what it gave, now or in an earlier run."""
+
+
+def anew(name: str, shape: tuple[int, ...], made: Callable[[], Tensor]) -> Tensor:
+    """Remember nothing."""
+    return made()
+
+
 def factor(
-    blocks: Callable[[], Iterable[Float[Tensor, "batch _ n"]]], m: int, n: int, batch: int, rank: int
+    blocks: Callable[[], Iterable[Float[Tensor, "batch _ n"]]],
+    m: int,
+    n: int,
+    batch: int,
+    rank: int,
+    *,
+    remember: Remember = anew,
 ) -> tuple[Float[Tensor, "batch m rank"], Float[Tensor, "batch n rank"]]:
     """Return (US, V) with B ~ US V^T for each of `batch` matrices of m x n, largest component first.
 
@@ -34,6 +50,7 @@ def factor(
         n: columns.
         batch: matrices that are read side by side.
         rank: columns of the factors, 1 to min(m, n).
+        remember: keeps what each pass gives, for a run that goes on from there.
 
     Returns:
         In the dtype of the blocks; V has orthonormal columns. The random start is the same every time, so equal input
@@ -41,9 +58,11 @@ def factor(
     """
     kept = min(2 * rank + OVERSAMPLING, m, n)
     rng = torch.Generator().manual_seed(0)
-    P, Z = _turn(blocks, torch.randn(batch, n, kept, generator=rng, dtype=torch.float64))
-    for _ in range(ROUNDS - 1):
-        P, Z = _turn(blocks, Z)
+    Z = torch.randn(batch, n, kept, generator=rng, dtype=torch.float64)
+    P = Z.new_zeros(batch, m, kept)
+    for turn in range(ROUNDS):
+        P = remember(f"P{turn}", (batch, m, kept), partial(_ahead, blocks, Z))
+        Z = remember(f"Z{turn}", (batch, n, kept), partial(_back, blocks, P, n))
     V, S, R = torch.linalg.svd(Z, full_matrices=False)
     V, S, R = V[..., :rank], S[..., :rank], R[:, :rank]
     sign = torch.where(V.sum(1, keepdim=True) < 0, -1.0, 1.0).double()
@@ -51,17 +70,21 @@ def factor(
     return US.to(P.dtype), (V * sign).to(P.dtype)
 
 
-def _turn(blocks: Callable[[], Iterable[Tensor]], Z: Tensor) -> tuple[Tensor, Tensor]:
-    """Return P = orth(B orth(Z)), in the dtype of the blocks, and B^T P, float64: two passes."""
+def _ahead(blocks: Callable[[], Iterable[Tensor]], Z: Tensor) -> Tensor:
+    """Return P = orth(B orth(Z)), in the dtype of the blocks: one pass."""
     Q = _orthonormal(Z)
     Y = torch.cat([block @ Q.to(block.dtype) for block in blocks()], 1)
-    P = _orthonormal(Y).to(Y.dtype)
-    Z, start = torch.zeros_like(Q), 0
+    return _orthonormal(Y).to(Y.dtype)
+
+
+def _back(blocks: Callable[[], Iterable[Tensor]], P: Tensor, n: int) -> Tensor:
+    """Return B^T P, float64: one pass."""
+    Z, start = torch.zeros(len(P), n, P.shape[2], dtype=torch.float64), 0
     for block in blocks():
         stop = start + block.shape[1]
         Z += (block.mT @ P[:, start:stop]).double()
         start = stop
-    return P, Z
+    return Z
 
 
 def _orthonormal(columns: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchmeso.algebra import gram, secular
 from torchmeso.algebra.spherical_harmonics import basis
-from torchmeso.bench import harmonics, held_out, sh_pca, sweeps
+from torchmeso.bench import harmonics, held_out, sh_pca, sweeps, table2
 from torchmeso.bench.suite import Context, Measurement, Row
 from torchmeso.bench.timing import time_together
 from torchmeso.compress import double_sh
@@ -24,13 +24,10 @@ from torchmeso.geometry import hemisphere
 from torchmeso.meso import bake_btf, generators
 from torchmeso.meso.bake_btf import BtfOptions
 
-PAPER_SECONDS = {(128, 25): 613, (128, 36): 761, (256, 25): 1067, (256, 36): 1251}
-"""leung2007tileable, Table II: side of the texture, view coefficients; 25 of the light; a Pentium IV of 3.2 GHz."""
-
 UNIT = 1 / 255
 
 
-def table2(context: Context) -> Iterator[Row]:
+def projected(context: Context) -> Iterator[Row]:
     """Raw bytes in memory to eight-bit coefficients: the rows of Table II that fit into memory as bytes."""
     for size in (128,) if context.quick else (128, 256):
         raw = like_a_btf(size)
@@ -40,7 +37,7 @@ def table2(context: Context) -> Iterator[Row]:
             start, cpu = time.perf_counter(), time.process_time()
             codes = _compressed(raw, light, view)
             seconds, used = time.perf_counter() - start, (time.process_time() - cpu) / 2
-            paper = PAPER_SECONDS[size, view_terms]
+            paper = table2.PAPER_SECONDS[size, view_terms]
             yield Row(
                 id=f"compress.table2.{size}.{view_terms}",
                 what=f"double SH by CLS, {size} x {size} x 81 x 81 bytes in memory to {view_terms} x 25 coefficients "
@@ -285,8 +282,10 @@ def _bisected(raw: Tensor, light: Side, view: Side) -> Tensor:
 
 
 MEASUREMENTS = (
-    Measurement("compress.table2", table2),
+    Measurement("compress.table2", projected),
     Measurement("compress.cls", constrained),
+    Measurement("compress.stream", table2.streamed),
+    Measurement("compress.jpeg", table2.pictures),
     Measurement("compress.quantised", quantised),
     Measurement("compress.eigen", eigen),
     Measurement("compress.rate", rate),

@@ -2,7 +2,8 @@
 
 The BTF in the numbers of a colour model (log Y, U/Y, V/Y by default, so that the eye's errors and not the highlights
 decide) is one matrix of texels x pairs of light and view for each channel. Each is cut to its leading components by
-subspace iteration over bands of texel rows: the BTF is never in memory, its factors are.
+subspace iteration over bands of texel rows: the BTF is never in memory, its factors are. Products are taken texel row
+by texel row, so that bands of any height give the same bits.
 
 Test: tests/compress/test_dfmf.py
 """
@@ -10,17 +11,16 @@ Test: tests/compress/test_dfmf.py
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from torchmeso.algebra import subspace
-from torchmeso.data import btfdbb_colour
+from torchmeso.data import bands, btfdbb_colour
 from torchmeso.data.btf import Bands
 from torchmeso.data.btfdbb_colour import Colour
+from torchmeso.data.journal import Journal
 from torchmeso.errors import check_range
-
-BLOCK_BYTES = 256 << 20
-"""Memory of one band of texel rows while fitting."""
 
 DEFAULT_RANK = 64
 
@@ -46,12 +46,19 @@ class DfmfOptions:
     accurate: bool = False
 
 
-def fit(table: Bands, options: DfmfOptions | None = None, *, progress: Progress = lambda share: None) -> Factors:
+def fit(
+    table: Bands,
+    options: DfmfOptions | None = None,
+    *,
+    kept: Journal | None = None,
+    progress: Progress = lambda share: None,
+) -> Factors:
     """Return for each channel U (pair, rank) and S V (texel, rank) as `data.btfdbb_write.write_dfmf` takes them.
 
     Args:
         table: in memory or on disk; read six times.
         options: rank and colour model.
+        kept: keeps what each pass over the table gives; a run that was killed goes on from there.
         progress: called with the share done, 0..1.
 
     Raises:
@@ -64,18 +71,30 @@ def fit(table: Bands, options: DfmfOptions | None = None, *, progress: Progress 
     most = min(pairs, texels)
     rank = min(DEFAULT_RANK, most) if options.rank is None else options.rank
     check_range("dfmf.rank", rank, 1, most)
-    step = max(1, min(height, BLOCK_BYTES // (pairs * width * 12)))
+    layout = bands.layout(table)[::-1]  # files begin at the bottom row
     done = 0
 
     def blocks() -> Iterator[Float[Tensor, "3 texel pair"]]:
         nonlocal done
-        for stop in range(height, 0, -step):  # files begin at the bottom row
-            start = max(stop - step, 0)
-            rgb = table.rows(start, stop)
-            x = btfdbb_colour.from_rgb(options.colour, rgb.double() if options.accurate else rgb).flip(2)
-            yield x.permute(4, 2, 3, 1, 0).reshape(3, -1, pairs)
-            done += stop - start
-            progress(done / (height * 2 * subspace.ROUNDS))
+        for band in bands.ahead(table, layout):
+            for row in reversed(range(band.stored.shape[2])):
+                rgb = bands.linear_row(table, band, row)
+                x = btfdbb_colour.from_rgb(options.colour, rgb.double() if options.accurate else rgb)
+                yield x.permute(3, 2, 1, 0).reshape(3, -1, pairs)
+                done += 1
+                progress(done / (height * 2 * subspace.ROUNDS))
 
-    by_texel, by_pair = subspace.factor(blocks, texels, pairs, 3, rank)
+    def remember(name: str, shape: tuple[int, ...], made: Callable[[], Tensor]) -> Tensor:
+        nonlocal done
+        if kept is None:
+            return made()
+        for dtype in (torch.float32, torch.float64):  # told apart by their size
+            if kept.has(name, shape, dtype):
+                done += height
+                return kept.read(name, shape, dtype)
+        found = made()
+        kept.write(name, found)
+        return found
+
+    by_texel, by_pair = subspace.factor(blocks, texels, pairs, 3, rank, remember=remember)
     return list(zip(by_pair, by_texel, strict=True))

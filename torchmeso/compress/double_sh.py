@@ -10,19 +10,20 @@ the energy of what it stands for over the hemisphere, omega_j the solid angle th
 (`hemisphere.solid_angles`). Harmonics that are orthonormal over the sphere then have no more energy than the
 hemisphere shows, which suppresses the large, opposed coefficients that cancel there and amplify noise.
 
-Columns (texels and channels) do not see each other: bands of texel rows of any height give the same bits. Before
-they are quantised the coefficients are kept in float16, whose step is far below that of uint8.
+Columns (texels and channels) do not see each other: bands of texel rows of any height give the same bits. The table is
+read in bands (`data.bands`), and its sRGB codes go to the kernel as they are. Before they are quantised the
+coefficients are kept in float16, whose step is far below that of uint8.
 
 Kernel: kernels_cl/compress/double_sh.cl          Test: tests/compress/test_double_sh.py
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Shaped
+from jaxtyping import Float, Shaped, UInt8
 from torch import Tensor
 
 from torchmeso.algebra import secular
@@ -30,13 +31,11 @@ from torchmeso.algebra.secular import Factors
 from torchmeso.algebra.spherical_harmonics import basis, degree_of
 from torchmeso.backends import BackendChoice, opencl
 from torchmeso.compress.quantize import Storage, quantize
+from torchmeso.data import bands, image
 from torchmeso.data.btf import Bands
 from torchmeso.data.sh_btf import ShBtf
 from torchmeso.errors import ShapeError, check_range
 from torchmeso.geometry.hemisphere import DirectionSet, solid_angles
-
-BAND_BYTES = 128 << 20
-"""Memory of one band of texel rows."""
 
 COLUMNS = 2048
 """Columns that go through both stages before the next ones do: what stands between them stays in the cache."""
@@ -46,6 +45,9 @@ REGISTERS = 26
 
 LANES, GROUPS = 16, 4
 """Columns that a work-item fits at once, and how often: as in the kernel."""
+
+LIT_SHARE = 0.9
+"""Share of columns up to which those that are not black are copied out first."""
 
 Progress = Callable[[float], None]
 
@@ -106,6 +108,18 @@ def side(what: str, directions: DirectionSet, terms: int, options: DoubleShOptio
     return Side(factors=factors, share=share)
 
 
+def sides(btf: Bands, options: DoubleShOptions) -> tuple[Side, Side]:
+    """Return both sides of a fit of `btf`: the light's and the view's.
+
+    Raises:
+        ConfigError: the directions cannot tell so many coefficients apart.
+    """
+    return (
+        side("light", btf.lights, options.light_terms, options),
+        side("view", btf.views, options.view_terms, options),
+    )
+
+
 def fit(
     btf: Bands,
     options: DoubleShOptions | None = None,
@@ -126,13 +140,11 @@ def fit(
         ShapeError: a value of the BTF is not finite.
     """
     options = options or DoubleShOptions()
-    light = side("light", btf.lights, options.light_terms, options)
-    view = side("view", btf.views, options.view_terms, options)
+    light, view = sides(btf, options)
     height, width = btf.texels
     found = torch.empty(light.terms * view.terms, height, width * 3, dtype=torch.float16)
-    for rows, samples in _bands(btf):
-        c = project(samples, light, view, backend=backend).flatten(0, 1)
-        found[:, rows] = _in_half(c, f"rows {rows.start} to {rows.stop - 1}").unflatten(1, (-1, width * 3))
+    for rows, c in coefficients(btf, light, view, bands.layout(btf), backend=backend):
+        found[:, rows] = c
         progress(0.9 * rows.stop / height)
     maps, scale, offset = quantised(found.unflatten(2, (width, 3)), options.storage)
     progress(1.0)
@@ -143,12 +155,59 @@ def fit(
     )  # fmt: skip
 
 
+def coefficients(
+    btf: Bands, light: Side, view: Side, wanted: Sequence[slice], *, backend: BackendChoice = "torch"
+) -> Iterator[tuple[slice, Float[Tensor, "k rows column"]]]:
+    """Yield bands of texel rows and their coefficients, k = (0,0), (0,1), ... of light and view, in float16.
+
+    Codes go to the kernel as they are stored, floats a row of texels at a time.
+
+    Raises:
+        FormatError: the file on disk is damaged.
+        ShapeError: a value of the BTF is not finite, or a coefficient too large.
+    """
+    for band in bands.ahead(btf, wanted):
+        n_light, n_view, height, width, _ = band.stored.shape
+        where = f"rows {band.rows.start} to {band.rows.stop - 1}"
+        if band.stored.dtype == torch.uint8 and opencl.resolve(backend) == "opencl":
+            c = _project_codes(band.stored.flatten(2), light, view).flatten(0, 1)
+            half = _in_half(c, where).unflatten(1, (height, width * 3))
+        else:
+            half = torch.empty(light.terms * view.terms, height, width * 3, dtype=torch.float16)
+            for row, samples in enumerate(bands.each_row(btf, band)):
+                c = project(samples.reshape(n_light, n_view, -1), light, view, backend=backend)
+                half[:, row] = _in_half(c.flatten(0, 1), where)
+        yield band.rows, half
+
+
+def _project_codes(codes: UInt8[Tensor, "light view column"], light: Side, view: Side) -> Tensor:
+    """Return the coefficients of columns of sRGB codes; black ones, masked texels, cost nothing where they are many."""
+    lit = _lit(codes)
+    if len(lit) > LIT_SHARE * codes.shape[2]:
+        return project(codes, light, view, srgb=True, backend="opencl")
+    out = torch.zeros(light.terms, view.terms, codes.shape[2])
+    if len(lit):
+        out[:, :, lit] = project(codes[:, :, lit], light, view, srgb=True, backend="opencl")
+    return out
+
+
+def _lit(codes: UInt8[Tensor, "light view column"]) -> Tensor:
+    """Return the columns that are not black; most are told by their first few samples."""
+    dark = (codes[:, 0].amax(0) == 0).nonzero()[:, 0]
+    if len(dark):
+        dark = dark[codes[:, :, dark].flatten(0, 1).amax(0) == 0]
+    keep = torch.ones(codes.shape[2], dtype=torch.bool)
+    keep[dark] = False
+    return keep.nonzero()[:, 0]
+
+
 def project(
     samples: Shaped[Tensor, "light view column"],
     light: Side,
     view: Side,
     *,
     unit: float = 1.0,
+    srgb: bool = False,
     backend: BackendChoice = "torch",
 ) -> Float[Tensor, "k_l k_v column"]:
     """Return the coefficients of columns of samples, one stage after the other.
@@ -158,13 +217,15 @@ def project(
         light: turns the values over the lights into k_l coefficients.
         view: turns those over the views into k_v coefficients.
         unit: T of a sample of 1: 1 / 255 for bytes of linear values.
+        srgb: whether samples are uint8 codes in sRGB.
         backend: torch computes in the dtype of the samples.
     """
     if opencl.resolve(backend) == "opencl":
-        return _project_opencl(samples, light, view, unit)
+        return _project_opencl(samples, light, view, unit, srgb)
     found = []
     for part in samples.split(COLUMNS, 2):
-        values = (part if part.is_floating_point() else part.float()) * unit
+        floats = part if part.is_floating_point() else part.float()
+        values = image.decode_codes(part) if srgb else floats * unit
         found.append(_stage(_stage(values, light).movedim(1, 0), view).movedim(1, 0))
     return torch.cat(found, 2)
 
@@ -185,22 +246,23 @@ class _Strided(NamedTuple):
     stride: int
 
 
-def _project_opencl(samples: Tensor, light: Side, view: Side, unit: float) -> Tensor:
+def _project_opencl(samples: Tensor, light: Side, view: Side, unit: float, srgb: bool) -> Tensor:
     columns, views = samples.shape[2], samples.shape[1]
     if columns < LANES:  # the kernel takes sixteen at a time
         padded = torch.nn.functional.pad(samples, (0, LANES - columns))
-        return _project_opencl(padded, light, view, unit)[:, :, :columns].contiguous()
+        return _project_opencl(padded, light, view, unit, srgb)[:, :, :columns].contiguous()
     samples = opencl.aligned(samples)
     width = min(COLUMNS, columns)
     between = torch.empty(views, light.terms, width)
     out = torch.empty(light.terms, view.terms, columns)
     device, device_between, device_out = (opencl.buffer(x) for x in (samples, between, out))
     tables = _device_factors(light), _device_factors(view)
+    codes = ("-DCODES",) * (samples.dtype == torch.uint8) + ("-DSRGB",) * srgb
     for at in range(0, columns, width):
         begin = min(at, columns - width)  # the last chunk is as wide as the others, and does some columns again
         raw = _Strided(device, begin, views * columns, columns)
         half = _Strided(device_between, 0, width, light.terms * width)
-        _enqueue(light, tables[0], raw, half, views, width, unit, codes=samples.dtype == torch.uint8)
+        _enqueue(light, tables[0], raw, half, views, width, unit, codes)
         turned = _Strided(device_between, 0, light.terms * width, width)
         whole = _Strided(device_out, begin, columns, view.terms * columns)
         _enqueue(view, tables[1], turned, whole, light.terms, width, 1.0)
@@ -224,28 +286,17 @@ def _enqueue(
     rows: int,
     columns: int,
     unit: float,
-    *,
-    codes: bool = False,
+    codes: tuple[str, ...] = (),
 ) -> None:
     """Put the fit of rows x columns vectors into the queue."""
     terms = by.terms
     block = -(-terms // -(-terms // REGISTERS))
     options = [f"-DSAMPLES={len(by.factors.left)}", f"-DTERMS={terms}", f"-DBLOCK={block}"]
-    options += ["-DCODES"] * codes + ["-DCONSTRAINED"] * (by.share is not None)
+    options += [*codes, *["-DCONSTRAINED"] * (by.share is not None)]
     run = opencl.kernel("compress/double_sh.cl", "fit", tuple(options))
     places = [np.int64(x) for x in (*source[1:], *target[1:])]
     size = -(-columns // (LANES * GROUPS)), rows
     run(opencl.queue(), size, (1, 1), table, source.buffer, target.buffer, np.int32(columns), *places, np.float32(unit))
-
-
-def _bands(btf: Bands) -> Iterator[tuple[slice, Float[Tensor, "light view column"]]]:
-    """Yield bands of texel rows, and their columns."""
-    height, width = btf.texels
-    row_bytes = len(btf.lights) * len(btf.views) * width * 3 * 4
-    step = max(1, min(height, BAND_BYTES // row_bytes))
-    for start in range(0, height, step):
-        rows = slice(start, min(start + step, height))
-        yield rows, btf.rows(rows.start, rows.stop).flatten(2)
 
 
 def _in_half(c: Float[Tensor, "k column"], where: str) -> Float[Tensor, "k column"]:

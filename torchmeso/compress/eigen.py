@@ -7,7 +7,7 @@ E = A W: the whole BTF is never in memory.
 Test: tests/compress/test_eigen.py
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -16,12 +16,10 @@ from torch import Tensor
 
 from torchmeso.algebra.gram import gram, right_basis
 from torchmeso.compress.quantize import Storage, quantize
+from torchmeso.data import bands
 from torchmeso.data.btf import Bands
 from torchmeso.data.eigen_btf import EigenBtf
 from torchmeso.errors import ConfigError
-
-BLOCK_BYTES = 256 << 20
-"""Memory of one band of texel rows while fitting."""
 
 Progress = Callable[[float], None]
 
@@ -52,35 +50,59 @@ def fit(btf: Bands, options: EigenOptions | None = None, *, progress: Progress =
         ShapeError: a value of the BTF is not finite.
     """
     options = options or EigenOptions()
+    check(btf, options)
     n_view = len(btf.views)
-    if not 1 <= options.rank <= n_view:
-        raise ConfigError(f"compress.rank: expected 1 to {n_view} (the number of views), got {options.rank}")
-
-    def bands(first: float, last: float) -> Iterator[Float[Tensor, "rows view"]]:
-        for share, band in _bands(btf):
-            yield band
-            progress(first + (last - first) * share)
-
-    basis = right_basis(gram(bands(0, 0.5), n_view), options.rank)
-    W = basis.vectors.float()
     height, width = btf.texels
+    layout = bands.layout(btf)
+    total = torch.zeros(n_view, n_view, dtype=torch.float64)
+    for rows, sum_so_far in grams(btf, layout, total):
+        total = sum_so_far
+        progress(0.5 * rows.stop / height)
+    W = right_basis(total, options.rank).vectors.float()
     maps = torch.empty(len(btf.lights), height, width, options.rank, 3)
-    row = 0
-    for band in bands(0.5, 1):
-        scores = (band @ W).unflatten(0, (-1, len(btf.lights), width, 3))
-        maps[:, row : row + len(scores)] = scores.permute(1, 0, 2, 4, 3)
-        row += len(scores)
+    for rows, E in scores(btf, W, layout):
+        maps[:, rows] = E.permute(1, 2, 3, 0, 4)
+        progress(0.5 + 0.5 * rows.stop / height)
     codes = quantize(maps, options.storage)
     return EigenBtf(
         maps=codes.codes, weights=W, scale=codes.scale, offset=codes.offset, lights=btf.lights, views=btf.views
     )
 
 
-def _bands(btf: Bands) -> Iterator[tuple[float, Float[Tensor, "rows view"]]]:
-    """Yield (share done, (row light W rgb, view)) band by band."""
-    height, width = btf.texels
-    row_bytes = len(btf.lights) * len(btf.views) * width * 3 * 4
-    step = max(1, min(height, BLOCK_BYTES // row_bytes))
-    for start in range(0, height, step):
-        band = btf.rows(start, min(start + step, height))
-        yield min(start + step, height) / height, band.permute(2, 0, 3, 4, 1).reshape(-1, len(btf.views))
+def check(btf: Bands, options: EigenOptions) -> None:
+    """Raise ConfigError unless the rank is between 1 and the number of views."""
+    n_view = len(btf.views)
+    if not 1 <= options.rank <= n_view:
+        raise ConfigError(f"compress.rank: expected 1 to {n_view} (the number of views), got {options.rank}")
+
+
+def grams(
+    btf: Bands, wanted: Sequence[slice], total: Float[Tensor, "view view"]
+) -> Iterator[tuple[slice, Float[Tensor, "view view"]]]:
+    """Yield bands of texel rows and the Gram matrix over views of `total` and all bands so far.
+
+    It is summed texel row by texel row: bands of any height give the same bits, and so does a sum that goes on.
+    """
+    for band in bands.ahead(btf, wanted):
+        for samples in bands.each_row(btf, band):
+            if bool(samples.any()):
+                total = total + gram([_matrix(samples)], len(total))
+        yield band.rows, total
+
+
+def scores(
+    btf: Bands, W: Float[Tensor, "view rank"], wanted: Sequence[slice]
+) -> Iterator[tuple[slice, Float[Tensor, "rank light rows W 3"]]]:
+    """Yield bands of texel rows and their eigen maps E = A W, the products texel row by texel row."""
+    for band in bands.ahead(btf, wanted):
+        n_light, _, height, width, _ = band.stored.shape
+        E = torch.zeros(W.shape[1], n_light, height, width, 3)
+        for row, samples in enumerate(bands.each_row(btf, band)):
+            if bool(samples.any()):
+                E[:, :, row] = (_matrix(samples) @ W).reshape(n_light, width, 3, -1).permute(3, 0, 1, 2)
+        yield band.rows, E
+
+
+def _matrix(samples: Float[Tensor, "light view W 3"]) -> Float[Tensor, "row view"]:
+    """Return one row of texels as the matrix whose columns are views."""
+    return samples.permute(0, 2, 3, 1).reshape(-1, samples.shape[1])

@@ -18,6 +18,7 @@ import torch
 import zarr
 from jaxtyping import Float, Shaped
 from torch import Tensor
+from zarr.buffer import cpu
 
 from torchmeso.data import address, image, store
 from torchmeso.data.pyramid import Footprint
@@ -118,11 +119,34 @@ class Btf:
             FormatError: the file on disk is damaged.
             ShapeError: a value is not finite, or beyond `LARGEST` (the place is named, the others are counted).
         """
+        return self.linear(self.stored_rows(start, stop), start)
+
+    def stored_rows(
+        self, start: int, stop: int, room: np.ndarray | None = None
+    ) -> Shaped[Tensor, "light view rows W 3"]:
+        """Return texel rows start .. stop as they are stored, reading no others; from disk into the bytes `room`.
+
+        Raises:
+            FormatError: the file on disk is damaged.
+        """
         if isinstance(self.images, Tensor):
-            stored = self.images[:, :, start:stop]
-        else:
-            with store.reading(str(self.images.store_path)):
-                stored = torch.from_numpy(np.asarray(self.images[:, :, start:stop]))
+            return self.images[:, :, start:stop]
+        with store.reading(str(self.images.store_path)):
+            wanted = slice(None), slice(None), slice(start, stop)
+            if room is None:
+                return torch.from_numpy(np.asarray(self.images[wanted]))
+            kind = np.dtype(self.images.dtype)
+            shape = (*self.images.shape[:2], stop - start, *self.images.shape[3:])
+            found = room[: math.prod(shape) * kind.itemsize].view(kind).reshape(shape)
+            self.images.get_basic_selection(wanted, out=cpu.NDBuffer.from_numpy_array(found))
+            return torch.from_numpy(found)
+
+    def linear(self, stored: Shaped[Tensor, "light view rows W 3"], start: int) -> Float[Tensor, "light view rows W 3"]:
+        """Return T as float32 of what is stored of the rows from `start` on.
+
+        Raises:
+            ShapeError: a value is not finite, or beyond `LARGEST` (the place is named, the others are counted).
+        """
         if self.encoding == "srgb":
             return image.decode_codes(stored)
         band = stored.float()

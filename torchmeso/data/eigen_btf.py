@@ -10,6 +10,7 @@ Test: tests/data/test_eigen_btf.py
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -18,7 +19,7 @@ import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor
 
-from torchmeso.data import address, mdf, pyramid, store
+from torchmeso.data import address, mdf, model_writer, pyramid, store
 from torchmeso.data.btf import horizon_falloff
 from torchmeso.data.mdf import Mdf
 from torchmeso.data.pyramid import Footprint
@@ -187,12 +188,62 @@ def save(eigen: EigenBtf, path: str | Path, *, silhouette: Mdf | None = None, **
     """Write a run-time model (.meso): one tensor per component, and the material's MDF where it has one."""
     tensors = {f"eigen.map.{k}": eigen.maps[..., k, :] for k in range(eigen.rank)}
     tensors |= {"eigen.weights": eigen.weights, "eigen.scale": eigen.scale, "eigen.offset": eigen.offset}
-    about: dict[str, object] = {"lights": eigen.lights.name, "views": eigen.views.name, "rank": eigen.rank}
-    parts: dict[str, object] = {"kind": "eigen", "eigen": about, **meta}
+    parts = _meta(eigen.lights, eigen.views, eigen.rank, meta)
     if silhouette is not None:
         mdf_tensors, parts["mdf"] = mdf.to_tensors(silhouette)
         tensors |= mdf_tensors
     store.write_model(path, tensors, parts)
+
+
+def write(
+    path: str | Path,
+    component: Callable[[int], tuple[Tensor, Tensor, Tensor]],
+    *,
+    weights: Float[Tensor, "view rank"],
+    texels: tuple[int, int],
+    dtype: torch.dtype,
+    lights: DirectionSet,
+    views: DirectionSet,
+    silhouette: Mdf | None = None,
+) -> None:
+    """Write a run-time model (.meso) as `save` does, one component at a time.
+
+    Args:
+        path: of the model.
+        component: called with k = 0, 1, ...; returns codes (light, H, W, 3), scale (3) and offset (3).
+        weights: W.
+        texels: height and width.
+        dtype: of the codes.
+        lights: directions towards the light.
+        views: directions towards the viewer.
+        silhouette: the material's MDF.
+
+    Raises:
+        StorageError: the disk is full, or the place cannot be written to.
+    """
+    rank = weights.shape[1]
+    layout: dict[str, tuple[torch.dtype, tuple[int, ...]]] = {
+        f"eigen.map.{k}": (dtype, (len(lights), *texels, 3)) for k in range(rank)
+    }
+    layout |= dict.fromkeys(("eigen.scale", "eigen.offset"), (torch.float32, (rank, 3)))
+    whole = {"eigen.weights": weights}
+    parts = _meta(lights, views, rank, {})
+    if silhouette is not None:
+        mdf_tensors, parts["mdf"] = mdf.to_tensors(silhouette)
+        whole |= mdf_tensors
+    layout |= {name: (x.dtype, tuple(x.shape)) for name, x in whole.items()}
+    with model_writer.in_parts(path, layout, parts) as put:
+        for k in range(rank):
+            codes, scale, offset = component(k)
+            put(f"eigen.map.{k}", codes, 0)
+            put("eigen.scale", scale[None], k)
+            put("eigen.offset", offset[None], k)
+        for name, x in whole.items():
+            put(name, x, 0)
+
+
+def _meta(lights: DirectionSet, views: DirectionSet, rank: int, more: dict[str, object]) -> dict:
+    return {"kind": "eigen", "eigen": {"lights": lights.name, "views": views.name, "rank": rank}, **more}
 
 
 def load(path: str | Path, *, rank: int | None = None) -> EigenBtf:

@@ -22,7 +22,7 @@ import torch
 from jaxtyping import Bool, Shaped
 from torch import Tensor
 
-from torchmeso.data import btf, image, store
+from torchmeso.data import bands, btf, image, store
 from torchmeso.data.btf import Btf, Encoding
 from torchmeso.errors import FormatError, check_memory
 from torchmeso.geometry import gaps
@@ -41,7 +41,7 @@ AHEAD = 8
 """Pictures being decoded while others are written."""
 
 ROWS = 16
-"""Rows of texels in a chunk: fits read bands of them, over all lights."""
+"""Rows of texels in a chunk, at most: fits read bands of them, over all lights and views (`bands.ROOM`)."""
 
 SHARD_BYTES = 128 << 20
 """About what is encoded at once."""
@@ -173,7 +173,7 @@ def to_table(
             **attributes,
         }
         with store.writing(path):
-            writer = store.open_blocks(path, _specs(shape, pictures.encoding), attributes)
+            writer = store.open_blocks(path, specs(shape, pictures.encoding), attributes)
             table = writer["images"]
             todo = [v for v in range(n_view) if not writer.is_done(v)]
             for v, block in _blocks(pictures, reader, shape, todo):
@@ -201,11 +201,12 @@ def _shape(pictures: PictureSet, reader: Reader, allow_missing: bool) -> tuple[i
     return len(pictures.lights), len(pictures.views), height, width, 3
 
 
-def _specs(shape: tuple[int, ...], encoding: Encoding) -> dict[str, store.ArraySpec]:
+def specs(shape: tuple[int, ...], encoding: Encoding) -> dict[str, store.ArraySpec]:
     """Return the layout for fits, which read bands of rows over all lights."""
     light, _, height, width, _ = shape
     dtype, size = ("uint8", 1) if encoding == "srgb" else ("float32", 4)
-    spec = btf.specs(shape, dtype, chunk=(light, 1, ROWS, width, 3))["images"]
+    fitting = max(1, min(ROWS, bands.ROOM // (light * shape[1] * width * 3 * size)))
+    spec = btf.specs(shape, dtype, chunk=(light, 1, fitting, width, 3))["images"]
     chunk_rows = spec.chunks[2]
     rows = chunk_rows * max(1, SHARD_BYTES // (light * chunk_rows * width * 3 * size))
     return {"images": replace(spec, shards=(light, 1, min(rows, -(-height // chunk_rows) * chunk_rows), width, 3))}
@@ -227,7 +228,7 @@ def _blocks(
         for l in present.nonzero()[:, 0].tolist():
             picture = next(decoded)
             _check_size(pictures, pictures.files[l, v], picture, (height, width))
-            block[l] = picture
+            block.numpy()[l] = picture.numpy()  # torch would wake all its threads for each picture
         if bool(present.any()) and not bool(present.all()):
             _fill_lights(pictures, block, present)
         yield v, block

@@ -12,6 +12,7 @@ Test: tests/data/test_sh_btf.py
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -21,7 +22,7 @@ from jaxtyping import Float, Shaped
 from torch import Tensor
 
 from torchmeso.algebra.spherical_harmonics import basis, degree_of
-from torchmeso.data import address, mdf, pyramid, store
+from torchmeso.data import address, mdf, model_writer, pyramid, store
 from torchmeso.data.btf import horizon_falloff
 from torchmeso.data.mdf import Mdf
 from torchmeso.data.pyramid import Footprint
@@ -203,14 +204,65 @@ def save(model: ShBtf, path: str | Path, *, silhouette: Mdf | None = None, **met
         for b, view in enumerate(bands(model.terms[1]))
     }
     tensors |= {"sh.scale": model.scale, "sh.offset": model.offset}
-    about: dict[str, object] = {
-        "lights": model.lights.name, "views": model.views.name, "terms": list(model.terms), "domain": "hemisphere_fit",
-    }  # fmt: skip
-    parts: dict[str, object] = {"kind": "sh", "sh": about, **meta}
+    parts = _meta(model.lights, model.views, model.terms, meta)
     if silhouette is not None:
         mdf_tensors, parts["mdf"] = mdf.to_tensors(silhouette)
         tensors |= mdf_tensors
     store.write_model(path, tensors, parts)
+
+
+def write(
+    path: str | Path,
+    coefficients: Callable[[int], tuple[Tensor, Tensor, Tensor]],
+    *,
+    terms: tuple[int, int],
+    texels: tuple[int, int],
+    dtype: torch.dtype,
+    lights: DirectionSet,
+    views: DirectionSet,
+    silhouette: Mdf | None = None,
+) -> None:
+    """Write a run-time model (.meso) as `save` does, one coefficient of the light at a time.
+
+    Args:
+        path: of the model.
+        coefficients: called with i = 0, 1, ...; returns codes (k_v, H, W, 3), scale (k_v, 3) and offset of (i, 0), ...
+        terms: k_l and k_v.
+        texels: height and width.
+        dtype: of the codes.
+        lights: directions towards the light.
+        views: directions towards the viewer.
+        silhouette: the material's MDF.
+
+    Raises:
+        StorageError: the disk is full, or the place cannot be written to.
+    """
+    layout: dict[str, tuple[torch.dtype, tuple[int, ...]]] = {
+        f"sh.map.{a}.{b}": (dtype, (2 * a + 1, 2 * b + 1, *texels, 3))
+        for a in range(len(bands(terms[0])))
+        for b in range(len(bands(terms[1])))
+    }
+    layout |= dict.fromkeys(("sh.scale", "sh.offset"), (torch.float32, (*terms, 3)))
+    parts = _meta(lights, views, terms, {})
+    depth: dict[str, Tensor] = {}
+    if silhouette is not None:
+        depth, parts["mdf"] = mdf.to_tensors(silhouette)
+        layout |= {name: (x.dtype, tuple(x.shape)) for name, x in depth.items()}
+    with model_writer.in_parts(path, layout, parts) as put:
+        for a, light in enumerate(bands(terms[0])):
+            for i in range(light.start, light.stop):
+                codes, scale, offset = coefficients(i)
+                put("sh.scale", scale[None], i)
+                put("sh.offset", offset[None], i)
+                for b, view in enumerate(bands(terms[1])):
+                    put(f"sh.map.{a}.{b}", codes[None, view], i - light.start)
+        for name, x in depth.items():
+            put(name, x, 0)
+
+
+def _meta(lights: DirectionSet, views: DirectionSet, terms: tuple[int, int], more: dict[str, object]) -> dict:
+    about = {"lights": lights.name, "views": views.name, "terms": list(terms), "domain": "hemisphere_fit"}
+    return {"kind": "sh", "sh": about, **more}
 
 
 def load(path: str | Path, *, degree: int | None = None) -> ShBtf:

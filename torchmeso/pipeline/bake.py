@@ -13,9 +13,12 @@ from dataclasses import asdict, dataclass
 from functools import cache, partial
 from pathlib import Path
 
-from torchmeso.compress import double_sh, eigen, sh_pca
+from torchmeso.compress import stream
+from torchmeso.compress.double_sh import DoubleShOptions
+from torchmeso.compress.eigen import EigenOptions
+from torchmeso.compress.sh_pca import ShPcaOptions
 from torchmeso.config import Config, MaterialConfig, MesoConfig
-from torchmeso.data import btf, eigen_btf, mdf, sh_btf, sh_pca_btf, store, textured
+from torchmeso.data import btf, eigen_btf, journal, mdf, sh_btf, sh_pca_btf, store, textured
 from torchmeso.errors import ConfigError, FormatError
 from torchmeso.geometry.mesh_file import Finish
 from torchmeso.meso import bake_btf, bake_mdf
@@ -85,16 +88,10 @@ def prepare_material(name: str, material: MaterialConfig, report: Report = silen
 def _compress(name: str, btf_table: Path, mdf_table: Path, material: MaterialConfig, out: Path, report: Report) -> None:
     """Fit the kind of model that the material asks for, and write it with the MDF."""
     table, depth = btf.load(btf_table), mdf.load(mdf_table)
-    if material.double_sh is not None:
-        told = partial(report, f"{name}: double-SH BTF")
-        model = double_sh.fit(table, material.double_sh, backend="auto", progress=told)
-        sh_btf.save(model, out, silhouette=depth)
-    elif material.sh_pca is not None:
-        told = partial(report, f"{name}: SH + PCA BTF")
-        sh_pca_btf.save(sh_pca.fit(table, material.sh_pca, progress=told), out, silhouette=depth)
-    else:
-        told = partial(report, f"{name}: eigen BTF")
-        eigen_btf.save(eigen.fit(table, material.eigen, progress=told), out, silhouette=depth)
+    options = material.double_sh or material.sh_pca or material.eigen
+    what = {DoubleShOptions: "double-SH", ShPcaOptions: "SH + PCA", EigenOptions: "eigen"}[type(options)]
+    told = partial(report, f"{name}: {what} BTF")
+    stream.fit(table, options, out, key=journal.state_of(btf_table), silhouette=depth, progress=told)
 
 
 def plain(finish: Finish) -> Material:

@@ -3,19 +3,20 @@
 Test: tests/pipeline/test_export.py
 """
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Literal
 
 from torchmeso import config
 from torchmeso.compress import dfmf
 from torchmeso.compress.dfmf import DfmfOptions
-from torchmeso.data import btf, btf_file, btfdbb_write, exr_stack
+from torchmeso.data import btf, btf_file, btfdbb_write, exr_stack, journal, store
 from torchmeso.data.store import replacing
 from torchmeso.errors import ConfigError
 from torchmeso.geometry import glb, mesh, mesh_file
 from torchmeso.geometry.glb import Body
 from torchmeso.geometry.mesh_file import Finish, Group
-from torchmeso.pipeline import scene
+from torchmeso.pipeline import bake, scene
 from torchmeso.pipeline.bake import Report, silent
 
 
@@ -76,8 +77,10 @@ def to_bonn(
         btfdbb_write.write_bdi(out, table, progress=lambda x: report("chunks", x))
         return
     options = DfmfOptions(rank=rank)
-    factors = dfmf.fit(table, options, progress=lambda x: report("factors", x))
-    btfdbb_write.write_dfmf(out, btfdbb_write.header_of(table, "!DFMF08FCR"), options.colour, factors)
+    key = store.content_hash(journal.state_of(path), bake.code_hash(), asdict(options))
+    with journal.beside(out, key) as kept:
+        factors = dfmf.fit(table, options, kept=kept, progress=lambda x: report("factors", x))
+        btfdbb_write.write_dfmf(out, btfdbb_write.header_of(table, "!DFMF08FCR"), options.colour, factors)
 
 
 def _of_configuration(settings: config.Config) -> list[Body]:

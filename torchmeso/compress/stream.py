@@ -1,0 +1,160 @@
+"""Fits that go from a file to a file: neither the BTF nor the model is ever in memory, and a killed fit goes on.
+
+Bands of texel rows are fitted as in `compress.double_sh` and `compress.eigen`, and kept in a journal beside the model
+(`data.journal`); a model needs the range of each of its maps before the first code can be written. Then one map after
+the other is collected over the bands, quantised and written. The file holds what `fit` and `save` would give, bit for
+bit. SH + PCA reads in bands too, but keeps its weights in memory and begins anew.
+
+Test: tests/compress/test_stream.py
+"""
+
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchmeso.algebra.gram import right_basis
+from torchmeso.backends import BackendChoice
+from torchmeso.compress import double_sh, eigen, sh_pca
+from torchmeso.compress.double_sh import DoubleShOptions, quantised
+from torchmeso.compress.eigen import EigenOptions
+from torchmeso.compress.quantize import quantize
+from torchmeso.compress.sh_pca import ShPcaOptions
+from torchmeso.data import bands, eigen_btf, journal, sh_btf, sh_pca_btf, store
+from torchmeso.data.btf import Bands
+from torchmeso.data.journal import Journal
+from torchmeso.data.mdf import Mdf
+
+Progress = Callable[[float], None]
+
+
+def fit(
+    btf: Bands,
+    options: EigenOptions | DoubleShOptions | ShPcaOptions,
+    path: str | Path,
+    *,
+    key: str,
+    backend: BackendChoice = "auto",
+    silhouette: Mdf | None = None,
+    progress: Progress = lambda share: None,
+) -> None:
+    """Write the model of `btf` to `path` (.meso), from where an earlier run with the same `key` and options stopped.
+
+    Args:
+        btf: on disk or in memory.
+        options: of the method.
+        path: of the model.
+        key: says which BTF it is, and changes with it.
+        backend: of double SH.
+        silhouette: the material's MDF, packed into the model.
+        progress: called with the share done, 0..1.
+
+    Raises:
+        ConfigError: the options do not fit the BTF's directions.
+        FormatError: the file on disk is damaged.
+        ShapeError: a value of the BTF is not finite, or a coefficient too large.
+        StorageError: the disk is full, or the place cannot be written to.
+    """
+    if isinstance(options, ShPcaOptions):
+        sh_pca_btf.save(sh_pca.fit(btf, options, progress=progress), path, silhouette=silhouette)
+        return
+    layout = bands.layout(btf)
+    job = store.content_hash(
+        key, type(options).__name__, asdict(options), backend, [(rows.start, rows.stop) for rows in layout]
+    )
+    if isinstance(options, EigenOptions):
+        eigen.check(btf, options)
+        with journal.beside(path, job) as kept:
+            _fit_eigen(btf, options, layout, kept, path, silhouette, progress)
+    else:
+        sides = double_sh.sides(btf, options)
+        with journal.beside(path, job) as kept:
+            _fit_double_sh(btf, options, sides, layout, kept, path, backend, silhouette, progress)
+
+
+def _fit_double_sh(
+    btf: Bands,
+    options: DoubleShOptions,
+    sides: tuple[double_sh.Side, double_sh.Side],
+    layout: list[slice],
+    kept: Journal,
+    path: str | Path,
+    backend: BackendChoice,
+    silhouette: Mdf | None,
+    progress: Progress,
+) -> None:
+    light, view = sides
+    height, width = btf.texels
+
+    def shape(rows: slice) -> tuple[int, ...]:
+        return light.terms * view.terms, rows.stop - rows.start, width * 3
+
+    todo = [rows for rows in layout if not kept.has(_name("c", rows), shape(rows), torch.float16)]
+    for rows, c in double_sh.coefficients(btf, light, view, todo, backend=backend):
+        kept.write(_name("c", rows), c)
+        progress(0.8 * rows.stop / height)
+
+    def coefficients(i: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Return codes, scale and offset of all coefficients (i, 0), (i, 1), ..."""
+        found = torch.empty(view.terms, height, width, 3, dtype=torch.float16)
+        for rows in layout:
+            part = kept.read(_name("c", rows), shape(rows), torch.float16, first=i * view.terms, count=view.terms)
+            found[:, rows] = part.unflatten(2, (width, 3))
+        progress(0.8 + 0.2 * (i + 1) / light.terms)
+        return quantised(found, options.storage)
+
+    sh_btf.write(
+        path, coefficients, terms=(light.terms, view.terms), texels=(height, width),
+        dtype=getattr(torch, options.storage), lights=btf.lights, views=btf.views, silhouette=silhouette,
+    )  # fmt: skip
+
+
+def _fit_eigen(
+    btf: Bands,
+    options: EigenOptions,
+    layout: list[slice],
+    kept: Journal,
+    path: str | Path,
+    silhouette: Mdf | None,
+    progress: Progress,
+) -> None:
+    height, width = btf.texels
+    n_light, n_view = len(btf.lights), len(btf.views)
+    square = n_view, n_view
+    total, todo = torch.zeros(square, dtype=torch.float64), layout
+    for at, rows in enumerate(layout):
+        if kept.has(_name("gram", rows), square, torch.float64):
+            total, todo = kept.read(_name("gram", rows), square, torch.float64), layout[at + 1 :]
+    for rows, sum_so_far in eigen.grams(btf, todo, total):
+        total = sum_so_far
+        kept.write(_name("gram", rows), total)
+        progress(0.4 * rows.stop / height)
+    W = right_basis(total, options.rank).vectors.float()
+
+    def shape(rows: slice) -> tuple[int, ...]:
+        return options.rank, n_light, rows.stop - rows.start, width, 3
+
+    todo = [rows for rows in layout if not kept.has(_name("E", rows), shape(rows), torch.float32)]
+    for rows, E in eigen.scores(btf, W, todo):
+        kept.write(_name("E", rows), E)
+        progress(0.4 + 0.4 * rows.stop / height)
+
+    def component(k: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Return codes, scale and offset of one eigen map."""
+        found = torch.empty(n_light, height, width, 3)
+        for rows in layout:
+            found[:, rows] = kept.read(_name("E", rows), shape(rows), torch.float32, first=k, count=1)[0]
+        codes = quantize(found[..., None, :], options.storage)
+        progress(0.8 + 0.2 * (k + 1) / options.rank)
+        return codes.codes[..., 0, :], codes.scale[0], codes.offset[0]
+
+    eigen_btf.write(
+        path, component, weights=W, texels=(height, width), dtype=getattr(torch, options.storage),
+        lights=btf.lights, views=btf.views, silhouette=silhouette,
+    )  # fmt: skip
+
+
+def _name(what: str, rows: slice) -> str:
+    return f"{what}.{rows.start}-{rows.stop}"
