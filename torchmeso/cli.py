@@ -144,9 +144,15 @@ def _bake_one(meso: str, out: Any, force: bool, options: dict[str, Any]) -> None
 @main.command()
 @click.argument("table")
 @click.option(
-    "--method", default="eigen", type=click.Choice(["eigen", "double-sh"]), show_default=True, help="Kind of model."
+    "--method",
+    default="eigen",
+    type=click.Choice(["eigen", "double-sh", "transform"]),
+    show_default=True,
+    help="Kind of model; transform: the smallest file, to --psnr or --size.",
 )
-@click.option("--rank", type=int, help="eigen: components kept, at most the number of views [4].")
+@click.option("--psnr", type=float, help="transform: least PSNR of the values of T, in dB.")
+@click.option("--size", help="transform: most bytes of the file without an MDF: 4MB, 300kB, 65536.")
+@click.option("--rank", type=int, help="eigen: components kept, at most the number of views [4]; transform: [all].")
 @click.option("--light-terms", type=int, help="double-sh: coefficients over the light: 1, 4, 9, 16, 25, 36 [25].")
 @click.option("--view-terms", type=int, help="double-sh: coefficients over the view [25].")
 @click.option(
@@ -172,8 +178,8 @@ def compress(
     **options: Any,
 ) -> None:
     """Compress a BTF TABLE (.btf.zarr or .btf, or a folder or zip of pictures) into a run-time model."""
-    from torchmeso.compress import double_sh, eigen
-    from torchmeso.data import eigen_btf, mdf, sh_btf
+    from torchmeso.compress import double_sh, eigen, transform
+    from torchmeso.data import eigen_btf, mdf, sh_btf, transform_btf
     from torchmeso.pipeline import picture_sets
 
     if not out.endswith(".meso"):
@@ -181,21 +187,34 @@ def compress(
     _refuse_to_replace(out, force)
     depth = None if silhouette is None else mdf.load(silhouette)
     given = {name: value for name, value in options.items() if value not in (None, False)}
-    kind = eigen.EigenOptions if method == "eigen" else double_sh.DoubleShOptions
-    known = {field.name for field in fields(kind)}
-    if (wrong := sorted(set(given) - known)) or (unbounded and method == "eigen"):
+    kinds: dict[str, Any] = {
+        "eigen": eigen.EigenOptions,
+        "double-sh": double_sh.DoubleShOptions,
+        "transform": transform.TransformOptions,
+    }
+    known = {field.name for field in fields(kinds[method])}
+    if method == "transform" and given["storage"] == "uint8":
+        del given["storage"]  # the default of the others
+    if (wrong := sorted(set(given) - known)) or (unbounded and method != "double-sh"):
         raise ConfigError(f"compress: --method {method} has no --{(wrong or ['unbounded'])[0].replace('_', '-')}")
     if unbounded:
         given["energy"] = None
-    chosen = kind(**given)
+    if "size" in given:
+        given["size"] = transform.parse_size(given["size"])
+    chosen = kinds[method](**given)
+    said = out
     with _progress() as report:
         source = picture_sets.open_btf(table, report, allow_missing=allow_missing)
         told = partial(report, f"{method} BTF")
         if isinstance(chosen, eigen.EigenOptions):
             eigen_btf.save(eigen.fit(source, chosen, progress=told), out, silhouette=depth)
+        elif isinstance(chosen, transform.TransformOptions):
+            packed, found = transform.fit(source, chosen, progress=told)
+            transform_btf.save(packed, out, silhouette=depth, psnr=round(found, 2))
+            said = f"{out}  PSNR {found:.1f} dB  {len(packed.codes)} of {len(packed.views)} view components"
         else:
             sh_btf.save(double_sh.fit(source, chosen, backend="auto", progress=told), out, silhouette=depth)
-    click.echo(out)
+    click.echo(said)
 
 
 @main.command()

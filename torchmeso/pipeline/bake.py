@@ -15,7 +15,7 @@ from pathlib import Path
 
 from torchmeso.compress import double_sh, eigen
 from torchmeso.config import Config, MaterialConfig, MesoConfig
-from torchmeso.data import btf, eigen_btf, mdf, sh_btf, store, textured
+from torchmeso.data import btf, eigen_btf, mdf, sh_btf, store, textured, transform_btf
 from torchmeso.errors import ConfigError, FormatError
 from torchmeso.geometry.mesh_file import Finish
 from torchmeso.meso import bake_btf, bake_mdf
@@ -163,6 +163,8 @@ def open_model(path: str | Path, *, depth: bool = True, rank: int | None = None)
     model = store.Model(path)
     if "sh" in model.meta:
         reflectance = sh_btf.load(path, degree=None if rank is None else rank - 1)
+    elif "transform" in model.meta:
+        reflectance = transform_btf.load(path, rank=rank).expanded()
     else:
         reflectance = eigen_btf.load(path, rank=rank)
     return Material(btf=reflectance, mdf=mdf.from_model(model) if depth else None)
