@@ -159,6 +159,12 @@ def psnr(T: Float[Tensor, "light view H W 3"], model: EigenBtf, peak: float | No
     return math.inf if total == 0 else 10 * math.log10(peak**2 * T.numel() / total)
 
 
+def psnr_of(T: Float[Tensor, "light view H W 3"], shown: Float[Tensor, "light view H W 3"]) -> float:
+    """Return the PSNR in dB of a decoded table, measured as `psnr` does."""
+    error = float((shown - T).square().mean(dtype=torch.float64))
+    return math.inf if error == 0 else 10 * math.log10(_peak(T) ** 2 / error)
+
+
 def _coded(C: Tensor, step: float, bases: list[Tensor], btf: Bands) -> TransformBtf:
     codes = _codes(C, step)
     # Components and terms behind the last code that is not 0 are not stored.
