@@ -16,8 +16,10 @@ from torchmeso.backends import opencl
 from torchmeso.cli import main
 from torchmeso.data import btf, image, mdf
 from torchmeso.data.btf import Btf
+from torchmeso.data.eigen_btf import EigenBtf
 from torchmeso.geometry import hemisphere
 from torchmeso.meso.generators import GENERATORS
+from torchmeso.pipeline.bake import open_model
 
 
 @pytest.fixture(autouse=True)
@@ -72,6 +74,12 @@ def test_from_a_mesostructure_to_a_model(tmp_path):
     said = run("info", model).stdout
     assert "coefficients: 4 of the light" in said
     assert "domain: sphere_projection" in said
+    budget = ("--method", "transform", "--psnr", 35, "--mdf", mdf_path, "--out", model, "--force")
+    said = run("compress", btf_path, *budget).stdout
+    assert said.startswith(f"{model}  PSNR 35.") and "of 8 view components" in said
+    assert "PSNR when fitted (dB): 35." in run("info", model).stdout
+    assert isinstance(open_model(model, rank=2).btf, EigenBtf)
+    assert run("compress", btf_path, "--method", "transform", "--size", "40kB", *budget[4:]).exit_code == 0
 
 
 def test_from_pictures_to_a_model(tmp_path):
@@ -140,6 +148,9 @@ REFUSED = [
     (["compress", "none.btf.zarr", "--out", "x.meso"], "expected a btf table, found none; bake it first"),
     (["compress", "none.btf.zarr", "--out", "x.zip"], "expected a name that ends in .meso"),
     (["compress", "a", "--energy", "2", "--out", "x.meso"], "--method eigen has no --energy"),
+    (["compress", "a", "--method", "transform", "--size", "big", "--out", "x.meso"], "a size like 4MB"),
+    (["compress", "a", "--method", "transform", "--energy", "2", "--out", "x.meso"], "transform has no --energy"),
+    (["compress", "a", "--psnr", "38", "--out", "x.meso"], "--method eigen has no --psnr"),
     (["compress", "a", "--unbounded", "--out", "x.meso"], "--method eigen has no --unbounded"),
     (["compress", "a", "--ridge", "0", "--out", "x.meso"], "--method eigen has no --ridge"),
     (["compress", "a", "--method", "double-sh", "--rank", "3", "--out", "x.meso"], "double-sh has no --rank"),

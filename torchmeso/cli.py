@@ -146,11 +146,15 @@ def _bake_one(meso: str, out: Any, force: bool, options: dict[str, Any]) -> None
 @click.option(
     "--method",
     default="eigen",
-    type=click.Choice(["eigen", "double-sh", "sh-pca", "ptm", "hsh"]),
+    type=click.Choice(["eigen", "double-sh", "sh-pca", "transform", "ptm", "hsh"]),
     show_default=True,
-    help="Kind of model; ptm and hsh: of an RTI set (.lp).",
+    help="Kind of model; transform: the smallest file, to --psnr or --size; ptm and hsh: of an RTI set (.lp).",
 )
-@click.option("--rank", type=int, help="eigen: components kept, at most the number of views [4]; sh-pca [16].")
+@click.option("--psnr", type=float, help="transform: least PSNR of the values of T, in dB.")
+@click.option("--size", help="transform: most bytes of the file without an MDF: 4MB, 300kB, 65536.")
+@click.option(
+    "--rank", type=int, help="eigen: components kept, at most the number of views [4]; sh-pca [16]; transform [all]."
+)
 @click.option(
     "--light-terms", type=int, help="double-sh, sh-pca: coefficients over the light: 1, 4, 9, 16, 25, 36 [25]."
 )
@@ -187,8 +191,8 @@ def compress(
     **options: Any,
 ) -> None:
     """Compress a BTF TABLE (.btf.zarr or .btf, a folder or zip of pictures, or an RTI set .lp) into a small model."""
-    from torchmeso.compress import double_sh, eigen, sh_pca, stream
-    from torchmeso.data import journal, mdf
+    from torchmeso.compress import double_sh, eigen, sh_pca, stream, transform
+    from torchmeso.data import journal, mdf, transform_btf
     from torchmeso.pipeline import picture_sets
     from torchmeso.pipeline.bake import code_hash
 
@@ -200,19 +204,34 @@ def compress(
     _refuse_to_replace(out, force)
     depth = None if silhouette is None else mdf.load(silhouette)
     given = {name: value for name, value in options.items() if value is not None and value is not False}
-    kinds = {"eigen": eigen.EigenOptions, "double-sh": double_sh.DoubleShOptions, "sh-pca": sh_pca.ShPcaOptions}
-    kind = kinds[method]
-    known = {field.name for field in fields(kind)}
+    kinds: dict[str, Any] = {
+        "eigen": eigen.EigenOptions,
+        "double-sh": double_sh.DoubleShOptions,
+        "sh-pca": sh_pca.ShPcaOptions,
+        "transform": transform.TransformOptions,
+    }
+    known = {field.name for field in fields(kinds[method])}
+    if method == "transform" and given["storage"] == "uint8":
+        del given["storage"]  # the default of the others
     if (wrong := sorted(set(given) - known)) or (unbounded and method != "double-sh"):
         raise ConfigError(f"compress: --method {method} has no --{(wrong or ['unbounded'])[0].replace('_', '-')}")
     if unbounded:
         given["energy"] = None
-    chosen = kind(**given)
+    if "size" in given:
+        given["size"] = transform.parse_size(given["size"])
+    chosen = kinds[method](**given)
+    said = out
     with _progress() as report:
         source = picture_sets.open_btf(table, report, allow_missing=allow_missing)
-        key = f"{journal.state_of(table)} {code_hash()}"
-        stream.fit(source, chosen, out, key=key, silhouette=depth, progress=partial(report, f"{method} BTF"))
-    click.echo(out)
+        told = partial(report, f"{method} BTF")
+        if isinstance(chosen, transform.TransformOptions):
+            packed, found = transform.fit(source, chosen, progress=told)
+            transform_btf.save(packed, out, silhouette=depth, psnr=round(found, 2))
+            said = f"{out}  PSNR {found:.1f} dB  {len(packed.codes)} of {len(packed.views)} view components"
+        else:
+            key = f"{journal.state_of(table)} {code_hash()}"
+            stream.fit(source, chosen, out, key=key, silhouette=depth, progress=told)
+    click.echo(said)
 
 
 def _relight(lights: str, method: Any, out: str, force: bool, options: dict[str, Any]) -> None:

@@ -14,6 +14,7 @@ from torch import Tensor
 from torchmeso.algebra import gram, secular
 from torchmeso.algebra.spherical_harmonics import basis
 from torchmeso.bench import harmonics, held_out, sh_pca, sweeps, table2
+from torchmeso.bench import rate as rates
 from torchmeso.bench.suite import Context, Measurement, Row
 from torchmeso.bench.timing import time_together
 from torchmeso.compress import double_sh
@@ -290,6 +291,8 @@ MEASUREMENTS = (
     Measurement("compress.eigen", eigen),
     Measurement("compress.rate", rate),
     Measurement("compress.sh_pca", sh_pca.rows),
+    Measurement("compress.budget", rates.budgets),
+    Measurement("compress.decode", rates.decoding),
     Measurement("compress.sh", harmonics.basis),
     Measurement("compress.rotation", harmonics.rotation),
     *held_out.MEASUREMENTS,

@@ -165,6 +165,16 @@ def _model(path: Path) -> dict[str, Any]:
     if "sh_pca" in model.meta:
         with store.reading(path):
             about |= _sh_pca(model)
+    if "transform" in model.meta:
+        transform = model.meta["transform"]
+        about |= {
+            "rank": transform["rank"],
+            "lights": transform["lights"],
+            "views": transform["views"],
+            "texels": "{1} x {0}".format(*transform["texels"]),
+            "PSNR when fitted (dB)": model.meta.get("psnr", "unknown"),
+            "BTF data": _held(model, "transform."),
+        }
     if "mdf" in model.meta:
         about["MDF"] = f"{model.meta['mdf']['directions']}, h = {model.meta['mdf']['h']:g} tiles"
         about["MDF data"] = _held(model, "mdf.")

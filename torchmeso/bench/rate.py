@@ -1,0 +1,152 @@
+"""Error over size at 10:1, 50:1 and 200:1 of eight-bit pictures, on baked materials, for every representation.
+
+Sizes are those of the files: eight bits of double SH and eigen maps, halves of the factors of one decomposition per
+channel (what Bonn's `.btf` files hold), streams and bases of the transform code. PSNR is that of all values, linear,
+the 99.5th percentile as peak; FLIP the mean of pictures spread over lights and views.
+
+Test: tests/bench/test_rate.py
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchmeso import quality
+from torchmeso.algebra.spherical_harmonics import basis, degree_of
+from torchmeso.bench import frames
+from torchmeso.bench.suite import Context, Row
+from torchmeso.bench.timing import time_together
+from torchmeso.compress import dfmf, double_sh, eigen, transform
+from torchmeso.compress.dfmf import DfmfOptions
+from torchmeso.compress.double_sh import DoubleShOptions
+from torchmeso.compress.transform import TransformOptions
+from torchmeso.data import btfdbb_colour
+from torchmeso.data.btf import Btf
+from torchmeso.data.btfdbb_colour import Colour
+from torchmeso.meso import bake_btf, generators
+from torchmeso.meso.bake_btf import BtfOptions
+from torchmeso.render.renderer import Renderer
+
+RATIOS = (10, 50, 200)
+TERMS = {10: (25, 25), 50: (16, 9), 200: (9, 4)}
+"""Double SH of light and view nearest to each ratio: 6561 / 625 = 10.5, 6561 / 144 = 45.6, 6561 / 36 = 182."""
+
+MATERIALS = ("brick", "weave", "squama")
+
+
+def budgets(context: Context) -> Iterator[Row]:
+    """Each representation at each size, on one material (quick) or all."""
+    for name in MATERIALS[:1] if context.quick else MATERIALS:
+        options = BtfOptions(texels=32, lights="ubo81", views="ubo81", samples=1, bounces=0)
+        table = bake_btf.in_memory(getattr(generators, name)(), options)
+        T = table.pictures().float()
+        yield from _at_all_sizes(name, Btf(images=T, lights=table.lights, views=table.views), T)
+
+
+def _at_all_sizes(name: str, table: Btf, T: Tensor) -> Iterator[Row]:
+    for ratio in RATIOS:
+        room = T.numel() // ratio
+        found: dict[str, float] = {}
+        for method, shown, size in _models(table, T, room, ratio):
+            found[method] = transform.psnr_of(T, shown)
+            goal, why = None, ""
+            if method == "transform" and ratio == 10:
+                goal, why = found["double-sh"] + 3, "; goal: double SH + 3 dB"
+            if method == "transform" and ratio == 200:
+                goal, why = max(found["svd"], found["dfmf"]) + 1, "; goal: one decomposition per channel + 1 dB"
+            yield Row(
+                id=f"compress.budget.{name}.{ratio}.{method}",
+                what=f"PSNR of all values of a baked {name}, 32 x 32 texels, 81 x 81 directions, "
+                f"{method} near {ratio}:1",
+                value=round(found[method], 2), unit="dB", better="higher",
+                goal=None if goal is None else round(goal, 2),
+                peer=f"{T.numel() / size:.1f}:1; {_flip(T, shown)}{why}",
+                curve={"series": f"{name} {method}", "x": size / T.numel()},
+            )  # fmt: skip
+
+
+def _models(
+    table: Btf, T: Tensor, room: int, ratio: int
+) -> Iterator[tuple[str, Float[Tensor, "light view H W 3"], int]]:
+    """Yield (method, what it shows, bytes of its file); the one whose goal needs the others comes last."""
+    height, width = table.texels
+    n_light, n_view = len(table.lights), len(table.views)
+    light_terms, view_terms = TERMS[ratio]
+    tries = []
+    for energy in (1.0, 10.0):
+        model = double_sh.fit(
+            table, DoubleShOptions(light_terms=light_terms, view_terms=view_terms, energy=energy), backend="auto"
+        )
+        y = [
+            basis(side.directions(), degree_of(n)).float()
+            for side, n in ((table.lights, light_terms), (table.views, view_terms))
+        ]
+        tries.append(torch.einsum("li,vj,ijhwc->lvhwc", *y, model.decoded()))
+    yield (
+        "double-sh",
+        max(tries, key=lambda shown: transform.psnr_of(T, shown)),
+        light_terms * view_terms * height * width * 3,
+    )
+    rank = max(1, min(n_view, room // (n_light * height * width * 3)))
+    eigen_btf = eigen.fit(table, eigen.EigenOptions(rank=rank))
+    shown = torch.einsum("lhwkc,vk->lvhwc", eigen_btf.decoded(), eigen_btf.weights)
+    yield "eigen", shown, eigen_btf.maps.numel() + 4 * eigen_btf.weights.numel()
+    per_component = 2 * 3 * (n_light * n_view + height * width)
+    rank = max(1, min(height * width, room // per_component))
+    for method, colour in (("svd", Colour(0)), ("dfmf", Colour(11))):
+        positive = Btf(images=T.clamp(min=0), lights=table.lights, views=table.views)
+        factors = dfmf.fit(positive, DfmfOptions(rank=rank, colour=colour))
+        x = torch.stack([U @ V.mT for U, V in factors], -1).unflatten(1, (height, width)).flip(1)
+        shown = btfdbb_colour.to_rgb(colour, x).unflatten(0, (n_view, n_light)).transpose(0, 1)
+        yield method, shown.float(), rank * per_component
+    packed, _ = transform.fit(table, TransformOptions(size=room))
+    opened = packed.expanded()
+    shown = torch.einsum("lhwkc,vk->lvhwc", opened.decoded(), opened.weights)
+    yield "transform", shown, transform.size(packed)
+
+
+def decoding(context: Context) -> Iterator[Row]:
+    """What each representation costs in a frame: the 12k knot of bricks at 800 x 600."""
+    texels = 16 if context.quick else 64
+    options = BtfOptions(texels=texels, lights="grid(12, 5, 80)", views="grid(12, 5, 80)", samples=1, bounces=0)
+    table = bake_btf.in_memory(generators.brick(), options)
+    timed = frames.knot()
+    scene = frames.build(timed)
+    camera = frames.camera_at(scene, timed, 0.5)
+    size = 3600 * 3 * texels * texels // 50
+    models = {
+        "double-sh": double_sh.fit(table, DoubleShOptions(), backend="auto"),
+        "eigen4": eigen.fit(table, eigen.EigenOptions(rank=4)),
+        **{
+            f"transform{rank}": transform.fit(table, TransformOptions(size=size, rank=rank))[0].expanded()
+            for rank in (4, 16, 60)
+        },
+    }
+    calls = {}
+    for name, model in models.items():
+        objects = tuple(replace(o, material=replace(o.material, btf=model)) for o in scene.objects)
+        renderer = Renderer(replace(scene, objects=objects))
+        calls[name] = lambda renderer=renderer: renderer.render(camera)
+    timing = time_together(calls, n=3 if context.quick else 9, warm=2)
+    for name, of in timing.items():
+        yield Row(
+            id=f"compress.decode.{name}",
+            what=f"a frame of the knot of bricks, 800 x 600, half covered, {name}",
+            value=round(min(of.wall, of.cpu), 1), unit="ms", better="lower", n=of.n,
+            peer="transform code near 50:1 on disk, by the components that it keeps" if "transform" in name else None,
+        )  # fmt: skip
+
+
+def _flip(T: Tensor, shown: Tensor) -> str:
+    """Return the mean FLIP of eight pictures, all at the exposure of the whole table."""
+    exposure = quality.find_exposure(T)
+    places = [(l, (7 * l + 3) % T.shape[1]) for l in range(0, T.shape[0], max(1, T.shape[0] // 8))]
+    errors = [
+        quality.flip(quality.to_screen(T[l, v], exposure), quality.to_screen(shown[l, v], exposure)) for l, v in places
+    ]
+    known = [e for e in errors if e is not None and math.isfinite(e)]
+    return f"FLIP {sum(known) / len(known):.3f}" if known else "FLIP not installed"
