@@ -4,7 +4,8 @@ wang2004gdm, section 3.1. A sample is one of three cases: a hit at distance d; `
 its top or bottom (or meets nothing within `cap`) and the distance there is known without a table; inside solid, d = 0.
 The three never mix: a query decides by weight which case it is, and averages over the samples of that case alone.
 A sample's distance is carried along the ray to the point asked about, d_i + (p_i - p) . w, which is exact before a
-plane however many of the eight corners lie inside solid.
+plane however many of the eight corners lie inside solid. Corners inside solid that lie ahead count as hits, those behind
+(a ray that leaves a surface) do not count.
 
 Test: tests/data/test_gdm.py
 """
@@ -119,14 +120,20 @@ class Gdm:
         index = voxel[..., :, None] * tables.distance.shape[1] + toward.node[..., None, :]
         solid = tables.solid[voxel]
         inside = (weight * solid).sum(-1) > 0.5
+        ahead = (away * w[..., None, :]).sum(-1)
         share = ((weight * (1 - solid))[..., :, None] * toward.weight[..., None, :]).flatten(-2)
         met = 1 - tables.left.flatten()[index].to(share.dtype).flatten(-2)
         hits, misses = (share * met).sum(-1), (share * (1 - met)).sum(-1)
         found = tables.distance.flatten()[index].to(share.dtype)
         if self.distance.dtype == torch.uint8:
             found = found * (self.cap / 255)
-        carried = found + (away * w[..., None, :]).sum(-1).unsqueeze(-1)
-        distance = (share * met * carried.flatten(-2)).sum(-1) / hits.clamp(min=1e-12)
+        carried = (share * met * (found + ahead.unsqueeze(-1)).flatten(-2)).sum(-1) / hits.clamp(min=1e-12)
+        # A ray towards corners inside solid meets something, though its neighbours that start outside may pass.
+        before = weight * solid * (ahead > 0)
+        blocks = before.sum(-1)
+        at_corner = (before * ahead).sum(-1) / blocks.clamp(min=1e-12)
+        distance = torch.where(hits > 1e-6, carried, at_corner)
+        hits = hits + blocks
         end = self.boundary(place, w)
         left = ~inside & (misses >= hits)
         distance = torch.where(left, end, torch.minimum(distance.clamp(min=0), end))

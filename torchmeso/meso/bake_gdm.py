@@ -3,10 +3,7 @@
 wang2004gdm, section 3.1: the tile is surrounded by copies of itself, so that rays leave through the top or the bottom.
 Here the copies reach as far as a distance can, and Embree casts the rays.
 
-Solid is what lies below an odd surface: along a ray that goes up, what is left through minus what is entered tells how
-many bodies the point is inside of (the top of the slab lies above everything). Bodies may therefore overlap, and a
-height field needs no underside. Five rays vote, so that one which slips through an edge, or a body that is not quite
-closed, decides nothing.
+What is solid is found out by `meso.solid`.
 
 Test: tests/meso/test_bake_gdm.py
 """
@@ -26,23 +23,19 @@ from torchmeso.data.address import texel_centres
 from torchmeso.data.gdm import Gdm
 from torchmeso.data.store import open_blocks, writing
 from torchmeso.errors import check_memory, check_range
-from torchmeso.geometry.directions import dot, from_angles, normalize
+from torchmeso.geometry.directions import dot, normalize
 from torchmeso.geometry.rays import RayScene
 from torchmeso.geometry.sphere import SphereGrid
+from torchmeso.meso import solid
 from torchmeso.meso.mesostructure import Mesostructure
 from torchmeso.transport import tracer
+from torchmeso.transport.tracer import Geometry
 
 BEHIND = 1e-4
 """Rays start this far (tile units) behind their point, so that a surface the point lies on is met."""
 
 BEYOND = 1e-5
 """And go on this far behind a surface that they pass."""
-
-VOTES, TILT_DEG = 5, 17.0
-"""Rays that go up from a point to find out whether it is inside, and how far they lean."""
-
-MOST_SURFACES = 256
-"""Surfaces a ray that goes up may pass."""
 
 RAYS = 1 << 19
 """Rays cast at once."""
@@ -100,13 +93,15 @@ class RayCastGdm:
     def __init__(self, meso: Mesostructure, cap: float):
         """Build the acceleration structure over the tile and its copies as far as `cap` reaches."""
         self.h, self.cap, self._geometry = meso.h, cap, meso.geometry
-        self._reach = max(cap, meso.h * math.tan(math.radians(TILT_DEG))) + 2 * BEHIND
+        self._reach = max(cap, meso.h * math.tan(math.radians(solid.TILT_DEG))) + 2 * BEHIND
         self._vertices, self._faces, self._source = tracer.unit_cell(
             meso.geometry.vertices, meso.geometry.faces, self._reach
         )
         a, b, c = self._vertices[self._faces].double().unbind(1)
         self._normal = normalize(torch.linalg.cross(b - a, c - a)).float()
         self._scene = RayScene(self._vertices, self._faces)
+        self._body = solid.bodies(meso.geometry, meso.h)[self._source]
+        self._divides = self._point_outwards(meso.geometry)[self._source]
 
     def cast(
         self, place: Float[Tensor, "n 3"], w: Float[Tensor, "n 3"], inside: Bool[Tensor, "n"]
@@ -134,29 +129,18 @@ class RayCastGdm:
         found = self._scene.first_hit(start, w, torch.full((len(w),), limit))
         return found.t, found.face
 
+    def _point_outwards(self, tile: Geometry) -> Bool[Tensor, "F"]:
+        """Turn the normals of triangles away from solid, whatever their winding; return which have solid on one side."""
+        a, b, c = tile.vertices[tile.faces].double().unbind(1)
+        middle, normal = (a + b + c) / 3, normalize(torch.linalg.cross(b - a, c - a))
+        before, behind = (self.inside((middle + s * 2 * BEHIND * normal).float()) for s in (1, -1))
+        turned = (before & ~behind)[self._source]
+        self._normal = torch.where(turned[:, None], -self._normal, self._normal)
+        return before != behind
+
     def inside(self, place: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
         """Return which points lie inside of at least one body."""
-        votes = torch.zeros(len(place))
-        start = self._home(place)
-        for k in range(VOTES):
-            theta = torch.tensor(math.radians(TILT_DEG) * (k + 1) / VOTES)
-            up = from_angles(theta, torch.tensor(2.4 * k + 0.3)).expand(len(place), 3)
-            votes += self._depth(start, up) > 0
-        return votes > VOTES / 2
-
-    def _depth(self, start: Float[Tensor, "n 3"], up: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
-        """Return how many surfaces each ray leaves through more than it enters."""
-        depth, active = torch.zeros(len(start)), torch.arange(len(start))
-        passed = torch.full((len(start),), BEHIND)
-        for _ in range(MOST_SURFACES):
-            found = self._scene.first_hit(start[active] + passed[active, None] * up[active], up[active])
-            struck = found.face >= 0
-            active = active[struck]
-            if not len(active):
-                break
-            depth[active] += dot(self._normal[found.face[struck]], up[active]).sign()
-            passed[active] += found.t[struck] + BEYOND
-        return depth
+        return solid.inside(self._scene, self._body, self._home(place), start=BEHIND)
 
     def matter(
         self, place: Float[Tensor, "n 3"], w: Float[Tensor, "n 3"], t: Float[Tensor, "n"], face: Int[Tensor, "n"]
@@ -166,7 +150,10 @@ class RayCastGdm:
         face = face.clamp(min=0)
         point = self._home(place) + torch.where(known, t, 0)[:, None] * w
         found = tracer.reflectance(self._geometry, self._source[face], point[:, :2])
-        parts = [self._normal[face], found.albedo, found.alpha[:, None], found.f0]
+        normal = self._normal[face]
+        against = torch.where((dot(normal, w) > 0)[:, None], -normal, normal)
+        normal = torch.where(self._divides[face][:, None], normal, against)
+        parts = [normal, found.albedo, found.alpha[:, None], found.f0]
         return torch.cat(parts, -1) * known[:, None]
 
     def _home(self, place: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
