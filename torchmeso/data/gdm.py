@@ -4,8 +4,8 @@ wang2004gdm, section 3.1. A sample is one of three cases: a hit at distance d; `
 its top or bottom (or meets nothing within `cap`) and the distance there is known without a table; inside solid, d = 0.
 The three never mix: a query decides by weight which case it is, and averages over the samples of that case alone.
 A sample's distance is carried along the ray to the point asked about, d_i + (p_i - p) . w, which is exact before a
-plane however many of the eight corners lie inside solid. Corners inside solid that lie ahead count as hits, those behind
-(a ray that leaves a surface) do not count.
+plane however many of the eight corners lie inside solid. Corners inside solid that lie ahead count as hits; those
+behind, as of a ray that leaves a surface, do not count.
 
 Test: tests/data/test_gdm.py
 """

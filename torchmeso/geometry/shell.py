@@ -10,7 +10,7 @@ A ray then needs no planes, no rule for concave and convex fins, and no toleranc
 the left or to the right of another (`left_of`), the same whichever tetrahedron asks, so a ray that goes into a
 tetrahedron comes out of it, and out of one of its other faces into the neighbour. Nothing can leak between them.
 
-Where prisms would turn inside out, because the surface bends more sharply than the shell is deep, columns are shortened.
+Where prisms would turn inside out, because the surface bends more sharply than the shell is deep, columns are shorter.
 
 Test: tests/geometry/test_shell.py
 """
@@ -32,6 +32,10 @@ BOTTOM, TOP, BORDER = -1, -2, -3
 
 OUTWARD = torch.tensor([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
 """Corners of the face opposite each corner of a tetrahedron, counter-clockwise seen from outside."""
+
+COLUMN = torch.tensor([[0, 1, 2, 2], [0, 1, 1, 2], [0, 0, 1, 2]])
+END = torch.tensor([[0, 0, 0, 1], [0, 1, 0, 1], [0, 1, 1, 1]])
+"""Corners of a prism's tetrahedra: columns in the order of their numbers, and which end."""
 
 SHRINK, SHORTEST = 0.85, 1e-3
 """Columns of prisms inside out are shortened by this factor until they are not, or as short as that."""
@@ -113,27 +117,17 @@ def build(mesh: Mesh, h: float, *, side: Side = "inward") -> Shell:
     order = corner[face].argsort(1)
     ordered = corner[face].gather(1, order)
     even = ((order[:, 1] - order[:, 0]) % 3 == 1)[:, None]
-    low, mid, top = ordered.unbind(1)
-    shape = [
-        [(low, 0), (mid, 0), (top, 0), (top, 1)],
-        [(low, 0), (mid, 1), (mid, 0), (top, 1)],
-        [(low, 0), (low, 1), (mid, 1), (top, 1)],
-    ]
-    place = {id(low): 0, id(mid): 1, id(top): 2}
-    tets = torch.stack([torch.stack([2 * x + up for x, up in t], 1) for t in shape], 1)
-    which = torch.tensor([[place[id(x)] for x, _ in t] for t in shape])
-    height = torch.tensor([[float(up) for _, up in t] for t in shape], dtype=torch.float64)
-    uv = mesh.uv.double()[mesh.faces[face]].gather(1, order[..., None].expand(-1, -1, 2))
-    uvz = torch.cat([uv[:, which], ((height - 1) * h)[None, :, :, None].expand(len(face), 3, 4, 1)], -1)
+    tets = 2 * ordered[:, COLUMN] + END
+    uv = mesh.uv.double()[mesh.faces[face]].gather(1, order[..., None].expand(-1, -1, 2))[:, COLUMN]
+    z = ((END - 1).double() * h)[None, :, :, None].expand(len(face), 3, 4, 1)
+    uvz = torch.cat([uv, z], -1)
     swapped = torch.tensor([1, 0, 2, 3])
     tets = torch.where(even[..., None], tets, tets[:, :, swapped]).reshape(-1, 4)
     uvz = torch.where(even[..., None, None], uvz, uvz[:, :, swapped]).reshape(-1, 4, 3)
 
     kept = _taper(base, way, tets, side)
     vertices = _columns(base, way * kept[:, None], side)
-    return Shell(
-        vertices=vertices, tets=tets, uvz=uvz, neighbour=_neighbours(tets), face=face, kept=kept,
-    )  # fmt: skip
+    return Shell(vertices=vertices, tets=tets, uvz=uvz, neighbour=_neighbours(tets), face=face, kept=kept)
 
 
 def boundary(shell: Shell, *, base: Literal["solid", "open"] = "solid") -> Boundary:
@@ -147,9 +141,15 @@ def boundary(shell: Shell, *, base: Literal["solid", "open"] = "solid") -> Bound
 def left_of(
     p: Float[Tensor, "*batch 2"], q: Float[Tensor, "*batch 2"], p_id: Int[Tensor, "*batch"], q_id: Int[Tensor, "*batch"]
 ) -> Bool[Tensor, "*batch"]:
-    """Return whether the origin lies to the left of the way from `p` to `q`; never the same for `q` to `p`."""
+    """Return whether the origin lies to the left of the way from `p` to `q`; never the same for `q` to `p`.
+
+    An origin on the line is taken to lie a little to the right of itself and by far less above: the same for all
+    lines, so that a ray through a vertex or an edge finds its way as any other ray does.
+    """
     area = p[..., 0] * q[..., 1] - p[..., 1] * q[..., 0]
-    return torch.where(p_id < q_id, area >= 0, area > 0)
+    across, up = (q - p).unbind(-1)
+    tie = torch.where(up == 0, torch.where(across == 0, p_id < q_id, across > 0), up < 0)
+    return torch.where(area == 0, tie, area > 0)
 
 
 def _columns(base: Tensor, way: Tensor, side: Side) -> Tensor:
@@ -160,17 +160,14 @@ def _columns(base: Tensor, way: Tensor, side: Side) -> Tensor:
 def _taper(base: Tensor, way: Tensor, tets: Tensor, side: Side) -> Float[Tensor, "C"]:
     """Return the share of its length that each column keeps so that no tetrahedron is inside out."""
     kept = torch.ones(len(base), dtype=torch.float64)
-    corner = base[tets // 2]
-    # A straight prism of these columns: a third of its base times its height.
-    flat = torch.stack([corner[:, k] for k in range(4)], 1)
+    area = _base_area(base[tets // 2].reshape(-1, 3, 4, 3)).repeat_interleave(3)
     length = way.norm(dim=-1)
     while True:
         vertices = _columns(base, way * kept[:, None], side)
         p = vertices[tets]
         volume = torch.linalg.det(p[:, 1:] - p[:, :1])
-        prism_base = _base_area(flat.reshape(-1, 3, 4, 3))
         height = (length * kept)[tets // 2].mean(1)
-        wrong = volume < LEAST_VOLUME * prism_base.repeat_interleave(3) * height
+        wrong = volume < LEAST_VOLUME * area * height  # of a straight prism: area * height
         columns = (tets[wrong] // 2).unique()
         columns = columns[kept[columns] > SHORTEST]
         if not len(columns):
@@ -188,7 +185,7 @@ def _neighbours(tets: Int[Tensor, "T 4"]) -> Int[Tensor, "T 4"]:
     """Return what lies behind each face; where more than two tetrahedra meet at one, all count as a border."""
     n = len(tets)
     triples = tets[:, OUTWARD].reshape(-1, 3)
-    keys, number, count = np.unique(np.sort(triples.numpy(), 1), axis=0, return_inverse=True, return_counts=True)
+    _, number, count = np.unique(np.sort(triples.numpy(), 1), axis=0, return_inverse=True, return_counts=True)
     number = torch.from_numpy(number.reshape(-1))
     order = number.argsort(stable=True)
     first = torch.from_numpy(np.concatenate([[0], count.cumsum()[:-1]]))
@@ -198,5 +195,4 @@ def _neighbours(tets: Int[Tensor, "T 4"]) -> Int[Tensor, "T 4"]:
     tops = (triples % 2).sum(1)
     found = torch.where(tops == 3, TOP, torch.where(tops == 0, BOTTOM, BORDER))
     found[one], found[other] = other // 4, one // 4
-    del keys
     return found.reshape(n, 4)

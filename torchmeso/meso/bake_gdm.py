@@ -130,7 +130,7 @@ class RayCastGdm:
         return found.t, found.face
 
     def _point_outwards(self, tile: Geometry) -> Bool[Tensor, "F"]:
-        """Turn the normals of triangles away from solid, whatever their winding; return which have solid on one side."""
+        """Turn normals away from solid, whatever the winding of triangles; return which have solid on one side."""
         a, b, c = tile.vertices[tile.faces].double().unbind(1)
         middle, normal = (a + b + c) / 3, normalize(torch.linalg.cross(b - a, c - a))
         before, behind = (self.inside((middle + s * 2 * BEHIND * normal).float()) for s in (1, -1))

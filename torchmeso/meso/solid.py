@@ -58,9 +58,7 @@ def bodies(geometry: Geometry, h: float) -> Int[Tensor, "F"]:
     return torch.from_numpy(np.where(sheet[of_face], -1, of_face)).long()
 
 
-def inside(
-    scene: RayScene, body: Int[Tensor, "F"], place: Float[Tensor, "n 3"], *, start: float
-) -> Bool[Tensor, "n"]:
+def inside(scene: RayScene, body: Int[Tensor, "F"], place: Float[Tensor, "n 3"], *, start: float) -> Bool[Tensor, "n"]:
     """Return which points lie inside a body.
 
     Args:

@@ -21,6 +21,9 @@ from torchmeso.geometry.shell import BOTTOM, OUTWARD, Shell, left_of
 MOST_STEPS = 4096
 """Tetrahedra that a ray may pass."""
 
+NUDGES = (1e-9, 1e-7, 1e-5, 1e-3, 0.0)
+"""A ray beside the face it comes in by is moved by these shares of the way to its middle, one after the other."""
+
 INTO = OUTWARD.flip(1)
 """Corners of the face a ray came in through, counter-clockwise seen by the ray."""
 
@@ -81,12 +84,14 @@ def trace(shell: Shell, gdm: Gdm | None, entries: Entries, *, queries: int = 1, 
     axes = around(entries.direction.double())
     rays = _Rays(entries.origin.double(), torch.stack([axes.t, axes.b, axes.n], 1))
     tet, corner = entries.tet.clone(), entries.corner.clone()
+    rays, enters = _into_face(shell, rays, tet, corner)
     share = _shares(shell, rays, tet, corner)
     start_t, start = share.t.clone(), share.place.clone()
     hit, t = torch.zeros(n, dtype=torch.bool), share.t.clone()
     place, direction = share.place.clone(), torch.zeros(n, 3, dtype=torch.float64)
     prism, through, prisms = tet // 3, torch.zeros(n, dtype=torch.long), torch.ones(n, dtype=torch.long)
-    active = torch.arange(n)
+    active = enters.nonzero()[:, 0]
+    through[~enters] = shell.neighbour[tet, corner][~enters]
     for _ in range(MOST_STEPS):
         if not len(active):
             break
@@ -140,6 +145,29 @@ def _seen(shell: Shell, rays: _Rays, vertex: Tensor) -> Tensor:
     """Return vertices (n, k) as seen along rays: across, up, and how far along."""
     way = shell.vertices[vertex] - rays.origin[:, None]
     return (rays.axes[:, None] * way[:, :, None]).sum(-1)
+
+
+def _into_face(shell: Shell, rays: _Rays, tet: Tensor, corner: Tensor) -> tuple[_Rays, Bool[Tensor, "n"]]:
+    """Return rays moved into the faces they come in by, and which come in: a face seen on edge lets none in.
+
+    What says by which face a ray comes in rounds otherwise than what is seen along it; a walk that begins beside its
+    face would not find out. The ways are of the order of rounding, and longer only as long as they do not suffice.
+    """
+    vertex = shell.tets[tet].gather(1, INTO[corner])
+    origin, enters = rays.origin.clone(), torch.zeros(len(tet), dtype=torch.bool)
+    active = torch.arange(len(tet))
+    for step in NUDGES:
+        own = _Rays(origin[active], rays.axes[active])
+        p = _seen(shell, own, vertex[active])[..., :2]
+        ids = vertex[active]
+        within = left_of(p, p.roll(-1, 1), ids, ids.roll(-1, 1)).all(1)
+        enters[active[within]] = True
+        active, p = active[~within], p[~within]
+        if not len(active):
+            break
+        way = p.mean(1) * step
+        origin[active] += (way[:, :, None] * rays.axes[active, :2]).sum(1)
+    return _Rays(origin, rays.axes), enters
 
 
 def _shares(shell: Shell, rays: _Rays, tet: Tensor, corner: Tensor) -> _Share:
