@@ -81,15 +81,18 @@ def demo(out: str) -> None:
 @main.command()
 @click.argument("configuration", required=False)
 @click.option("--meso", help=f"Mesostructure to bake alone: {MESOS}.")
-@click.option("--out", help="With --meso the table (.btf.zarr or .mdf.zarr), else a folder; none = the cache.")
-@click.option("--texels", type=int, help="Side of the texture (default 64 for a BTF, 256 for an MDF).")
+@click.option("--out", help="With --meso the table (.btf.zarr, .mdf.zarr, .gdm.zarr), else a folder; none = the cache.")
+@click.option("--texels", type=int, help="Side of the texture (default 64 for a BTF and a GDM, 256 for an MDF).")
 @click.option("--lights", help="Light directions of a BTF [grid(12, 5, 80)].")
 @click.option("--views", help="View directions [grid(12, 5, 80); MDF: grid(15, 10, 87.5)].")
 @click.option("--samples", type=int, help="Rays per texel and view of a BTF [4].")
 @click.option("--bounces", type=int, help="Reflections followed by a BTF; 0 = direct light only [2].")
+@click.option("--layers", type=int, help="Voxels of a GDM from the bottom to the top of the slab [32].")
+@click.option("--cap", type=float, help="Longest distance in a GDM, tile units [1].")
+@click.option("--supersample", type=int, help="GDM: points along a side of a voxel that tell whether it is solid [1].")
 @click.option("--force", is_flag=True, help="Replace a finished table.")
 def bake(configuration: str | None, meso: str | None, out: str | None, force: bool, **options: Any) -> None:
-    """Bake BTF and MDF tables: of every material in CONFIGURATION, or of one mesostructure (--meso)."""
+    """Bake BTF and MDF of every material in CONFIGURATION, or a BTF, MDF or GDM of one mesostructure (--meso)."""
     from pathlib import Path
 
     if (configuration is None) == (meso is None):
@@ -98,7 +101,7 @@ def bake(configuration: str | None, meso: str | None, out: str | None, force: bo
         _bake_all(configuration, None if out is None else Path(out), force)
         return
     if out is None:
-        raise click.UsageError("--meso needs --out, a name that ends in .btf.zarr or .mdf.zarr")
+        raise click.UsageError("--meso needs --out, a name that ends in .btf.zarr, .mdf.zarr or .gdm.zarr")
     assert meso is not None
     _bake_one(meso, Path(out), force, {k: v for k, v in options.items() if v is not None})
 
@@ -121,23 +124,28 @@ def _bake_all(configuration: str, out: Any, force: bool) -> None:
 
 def _bake_one(meso: str, out: Any, force: bool, options: dict[str, Any]) -> None:
     from torchmeso import config
-    from torchmeso.meso import bake_btf, bake_mdf
+    from torchmeso.meso import bake_btf, bake_gdm, bake_mdf
     from torchmeso.meso.bake_btf import BtfOptions
+    from torchmeso.meso.bake_gdm import GdmOptions
     from torchmeso.meso.bake_mdf import MdfOptions
 
+    kinds = {
+        ".btf.zarr": ("BTF", BtfOptions, bake_btf.bake, {"texels", "lights", "views", "samples", "bounces"}),
+        ".mdf.zarr": ("MDF", MdfOptions, bake_mdf.bake, {"texels", "views"}),
+        ".gdm.zarr": ("GDM", GdmOptions, bake_gdm.bake, {"texels", "layers", "cap", "supersample"}),
+    }
+    suffix = next((x for x in kinds if out.name.endswith(x)), None)
+    if suffix is None:
+        raise ConfigError(f"{out}: expected a name that ends in .btf.zarr, .mdf.zarr or .gdm.zarr")
+    kind, dials, job, known = kinds[suffix]
+    wrong = set(options) - known
+    if wrong:
+        raise ConfigError(f"bake: {kind} tables have no --{min(wrong)}; their dials are --{', --'.join(sorted(known))}")
     tile = config.build_meso({"type": meso})
     about: dict[str, object] = {"source": {"type": meso}}
     _refuse_to_replace(out, force)
     with _progress() as report:
-        if out.name.endswith(".btf.zarr"):
-            bake_btf.bake(tile, BtfOptions(**options), out, about=about, progress=lambda x: report(f"{meso}: BTF", x))
-        elif out.name.endswith(".mdf.zarr"):
-            wrong = set(options) - {"texels", "views"}
-            if wrong:
-                raise ConfigError(f"bake: an MDF has no --{min(wrong)}; its dials are --texels and --views")
-            bake_mdf.bake(tile, MdfOptions(**options), out, about=about, progress=lambda x: report(f"{meso}: MDF", x))
-        else:
-            raise ConfigError(f"{out}: expected a name that ends in .btf.zarr or .mdf.zarr")
+        job(tile, dials(**options), out, about=about, progress=lambda x: report(f"{meso}: {kind}", x))
     click.echo(out)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from torchmeso import config
-from torchmeso.data import btf, btfdbb, hsh, image, mdf, picture_set, ptm, rti, store
+from torchmeso.data import btf, btfdbb, gdm, hsh, image, mdf, picture_set, ptm, rti, store
 from torchmeso.errors import FormatError, human_size
 from torchmeso.geometry import mesh, mesh_file, unwrap
 from torchmeso.geometry.mesh_file import Group
@@ -31,6 +31,8 @@ def file(path: str | Path) -> dict[str, Any]:
         return _btf(path)
     if name.endswith(".mdf.zarr"):
         return _mdf(path)
+    if name.endswith(".gdm.zarr"):
+        return _gdm(path)
     if name.endswith(".btf"):
         return _bonn(path)
     if picture_sets.is_one(path):
@@ -47,7 +49,7 @@ def file(path: str | Path) -> dict[str, Any]:
     if name.endswith((".obj", ".ply", ".glb", ".gltf", ".off", ".stl")):
         return _mesh(path)
     raise FormatError(
-        f"{path}: expected a table (.btf.zarr, .mdf.zarr, .btf), a model (.meso), a configuration (.yaml), "
+        f"{path}: expected a table (.btf.zarr, .mdf.zarr, .gdm.zarr, .btf), a model (.meso), a configuration (.yaml), "
         "a folder or zip of the pictures of a BTF, an RTI file (.lp, .ptm, .rti), a picture or a mesh"
     )
 
@@ -132,6 +134,22 @@ def _mdf(path: Path) -> dict[str, Any]:
         "largest drop": table.delta_max,
         "entries without a hit": 0.0 if table.no_hit is None else float(table.no_hit.float().mean()),
         **_origin(store.attributes(group)),
+        "on disk": _size(path),
+    }
+
+
+def _gdm(path: Path) -> dict[str, Any]:
+    table = gdm.load(path)
+    layers, height, width = table.voxels
+    return {
+        "kind": "GDM table",
+        "voxels": f"{width} x {height} x {layers}",
+        "directions": f"{table.directions.n_theta} x {table.directions.n_phi}",
+        "slab depth (tiles)": table.h,
+        "longest distance (tiles)": table.cap,
+        "solid": float((table.occupancy > 0.5).float().mean()),
+        "rays that leave": float(table.left.float().mean()),
+        **_origin(store.attributes(store.open_table(path, "gdm"))),
         "on disk": _size(path),
     }
 

@@ -137,7 +137,7 @@ class MeshTracer:
             uv = None
             if g.uv is not None:
                 uv = (hits.barycentric[mine].unsqueeze(-1) * g.uv[g.faces[own]]).sum(1)
-            found = _reflectance(g, own, uv)
+            found = reflectance(g, own, uv)
             for whole, piece in zip(parts, found, strict=True):
                 whole[mine] = piece
         return parts
@@ -150,7 +150,7 @@ class TileTracer:
         """Build the acceleration structure; triangles that stick out of the cell are brought in from all sides."""
         self._geometry, self._h = geometry, h
         self._margin = 1e-4  # tile units around cell and slab, so that nothing on a border is missed
-        vertices, faces, source = _unit_cell(geometry.vertices, geometry.faces, self._margin)
+        vertices, faces, source = unit_cell(geometry.vertices, geometry.faces, self._margin)
         self._vertices, self._faces, self._source = vertices, faces, source
         self._scene = RayScene(vertices, faces)
 
@@ -174,7 +174,7 @@ class TileTracer:
         hit = face >= 0
         cell_face = face.clamp(min=0)
         normal = _facing_normal(self._vertices, self._faces, cell_face, direction)
-        material = _reflectance(self._geometry, self._source[cell_face], position[:, :2])
+        material = reflectance(self._geometry, self._source[cell_face], position[:, :2])
         return Surface(hit, torch.where(hit, t_total, torch.inf), position, normal, material)
 
     def occluded(
@@ -225,8 +225,10 @@ class TileTracer:
         return torch.where(way[:, 2] == 0, torch.inf, leave).clamp(min=0)
 
 
-def _unit_cell(vertices: Tensor, faces: Tensor, margin: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Return all periodic copies of the triangles that touch the unit cell, and each copy's original face."""
+def unit_cell(
+    vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], margin: float
+) -> tuple[Float[Tensor, "W 3"], Int[Tensor, "G 3"], Int[Tensor, "G"]]:
+    """Return all periodic copies of the triangles that come within `margin` of the unit cell, and their originals."""
     corner = vertices[faces]
     low, high = corner[..., :2].amin(1), corner[..., :2].amax(1)
     first, last = (-(high.amax(0) + margin).floor()).int().tolist(), (1 - (low.amin(0) - margin).floor()).int().tolist()
@@ -248,7 +250,8 @@ def _facing_normal(vertices: Tensor, faces: Tensor, face: Tensor, direction: Ten
     return torch.where((dot(normal, direction) > 0)[:, None], -normal, normal)
 
 
-def _reflectance(g: Geometry, face: Tensor, uv: Tensor | None) -> Reflectance:
+def reflectance(g: Geometry, face: Int[Tensor, "n"], uv: Float[Tensor, "n 2"] | None) -> Reflectance:
+    """Return the material of triangles, with the albedo map (where there is one) at `uv`."""
     part = g.part[face]
     albedo = g.palette.albedo[part]
     if g.albedo_map is not None:

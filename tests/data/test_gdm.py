@@ -1,0 +1,148 @@
+import pytest
+import torch
+
+from tests.tolerances import FLOAT64
+from torchmeso.data import gdm as gdm_module
+from torchmeso.data.gdm import Gdm
+from torchmeso.errors import ConfigError, FormatError, ShapeError
+from torchmeso.geometry.directions import normalize
+from torchmeso.geometry.sphere import SphereGrid
+
+GRID = SphereGrid(n_theta=6, n_phi=8)
+H = 0.4
+
+
+def layered(level, *, texels=5, layers=9, cap=2.0, dtype=torch.float64):
+    """A half-space of material below z = level: every distance is known."""
+    z = (-H + H * torch.arange(layers, dtype=torch.float64) / (layers - 1))[:, None, None, None, None]
+    climb = GRID.directions(torch.float64)[..., 2]
+    way = (level - z) / climb
+    shape = (layers, texels, texels, 6, 8)
+    solid = (z < level).expand(layers, texels, texels, 1, 1)[..., 0, 0]
+    left = ((climb > 0) | (way > cap)).expand(shape) & ~solid[..., None, None]
+    distance = torch.where(left | solid[..., None, None], 0, way.clamp(0).expand(shape))
+    matter = torch.zeros(layers, texels, texels, 10)
+    matter[..., 2] = 1
+    matter[..., 3:7] = 0.5
+    return Gdm(
+        distance=distance.to(dtype), left=left, occupancy=solid.float(), matter=matter, h=H, cap=cap,
+    )  # fmt: skip
+
+
+def points(n, rng):
+    place = 3 * torch.rand(n, 3, generator=rng, dtype=torch.float64) - 1
+    place[:, 2] = -H * torch.rand(n, generator=rng, dtype=torch.float64)
+    return place, GRID.directions(torch.float64).reshape(-1, 3)[torch.randint(48, (n,), generator=rng)]
+
+
+def test_exact_before_a_plane_between_the_layers(rng):
+    """The corners inside solid say nothing, and the others carry their distance to the point."""
+    level = -0.27
+    gdm = layered(level)
+    place, w = points(5000, rng)
+    found = gdm.evaluate(place, w)
+    step = H / 8
+    outside = place[:, 2] > level + step / 2
+    down = outside & (w[:, 2] < 0) & ((level - place[:, 2]) / w[:, 2] < gdm.cap - 0.5)
+    torch.testing.assert_close(found.distance[down], ((level - place[:, 2]) / w[:, 2])[down], **FLOAT64)
+    assert not found.left[down].any()
+    up = outside & (w[:, 2] > 0)
+    assert found.left[up].all()
+    torch.testing.assert_close(found.distance[up], (-place[:, 2] / w[:, 2]).clamp(max=gdm.cap)[up], **FLOAT64)
+    inside = place[:, 2] < level - step
+    assert (found.distance[inside] == 0).all()
+    assert not found.left[inside].any()
+
+
+def test_repeats_in_u_and_v_and_holds_in_z(rng):
+    gdm = layered(-0.2)
+    place, w = points(200, rng)
+    for shift in ((1.0, 0.0, 0.0), (-3.0, 7.0, 0.0)):
+        moved = gdm.evaluate(place + torch.tensor(shift, dtype=torch.float64), w)
+        torch.testing.assert_close(moved.distance, gdm.evaluate(place, w).distance, rtol=0, atol=1e-9)
+    above = place.clone()
+    above[:, 2] = 0.3
+    on_top = place.clone()
+    on_top[:, 2] = 0
+    torch.testing.assert_close(gdm.evaluate(above, w).distance, gdm.evaluate(on_top, w).distance, **FLOAT64)
+
+
+def test_a_ray_that_never_climbs_ends_at_the_cap(rng):
+    gdm = layered(-0.2)
+    place, _ = points(50, rng)
+    level = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64).expand(50, 3)
+    assert (gdm.boundary(place, level) == gdm.cap).all()
+    assert torch.isfinite(gdm.evaluate(place, level).distance).all()
+
+
+def test_bytes_are_as_good_as_their_step(rng):
+    exact = layered(-0.27)
+    codes = (exact.distance * (255 / exact.cap)).round().clamp(0, 255).to(torch.uint8)
+    coarse = Gdm(distance=codes, left=exact.left, occupancy=exact.occupancy, matter=exact.matter, h=H, cap=exact.cap)
+    place = points(3000, rng)[0]
+    w = normalize(torch.randn(3000, 3, generator=rng, dtype=torch.float64))
+    a, b = exact.evaluate(place, w), coarse.evaluate(place, w)
+    assert torch.equal(a.left, b.left)
+    assert (a.distance - b.distance).abs().max() <= 0.51 * exact.cap / 255 + 1e-9
+
+
+def test_gradient_moves_the_hit_with_the_point(rng):
+    gdm = layered(-0.27)
+    place, _ = points(100, rng)
+    place[:, 2] = -0.1
+    w = GRID.directions(torch.float64)[4, 2].expand(100, 3)
+    place.requires_grad_(True)
+    gdm.evaluate(place, w).distance.sum().backward()
+    expected = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64) / -w[:, 2:]
+    torch.testing.assert_close(place.grad, expected.expand(100, 3), rtol=0, atol=1e-9)
+
+
+def test_matter_is_that_of_the_corners_that_have_some(rng):
+    gdm = layered(-0.2)
+    gdm.matter[4:] = 0  # nothing is near the upper layers
+    place, _ = points(300, rng)
+    found = gdm.matter_at(place)
+    torch.testing.assert_close(found.normal.norm(dim=-1), torch.ones(300, dtype=torch.float64), **FLOAT64)
+    near = place[:, 2] < -H + 3.5 * H / 8
+    torch.testing.assert_close(
+        found.albedo[near], torch.full((int(near.sum()), 3), 0.5, dtype=torch.float64), **FLOAT64
+    )
+    assert (found.alpha >= 0.02).all()
+
+
+def test_a_file_holds_all_of_it(tmp_path):
+    gdm = layered(-0.2, dtype=torch.float32)
+    gdm_module.save(gdm, tmp_path / "a.gdm.zarr")
+    again = gdm_module.load(tmp_path / "a.gdm.zarr")
+    for name in ("distance", "left", "occupancy", "matter"):
+        assert torch.equal(getattr(gdm, name), getattr(again, name))
+    assert (again.h, again.cap, again.voxels, again.directions) == (H, 2.0, (9, 5, 5), GRID)
+    with pytest.raises(FormatError, match="expected a gdm table, found none"):
+        gdm_module.load(tmp_path / "b.gdm.zarr")
+
+
+@pytest.mark.errors
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"left": torch.zeros(2, 2, dtype=torch.bool)}, ShapeError, r"gdm\.left: expected shape"),
+        ({"distance": torch.zeros(9, 5, 5, 6, 8, dtype=torch.int64)}, ShapeError, "expected uint8, float16"),
+        ({"occupancy": torch.full((9, 5, 5), 2.0)}, ShapeError, r"gdm\.occupancy: expected finite values from 0 to 1"),
+        ({"h": 0.0}, ConfigError, r"gdm\.h"),
+        ({"cap": -1.0}, ConfigError, r"gdm\.cap"),
+    ],
+)
+def test_parts_that_do_not_match_are_refused(change, error, message):
+    gdm = layered(-0.2)
+    parts = {n: getattr(gdm, n) for n in ("distance", "left", "occupancy", "matter", "h", "cap")}
+    with pytest.raises(error, match=message):
+        Gdm(**{**parts, **change})
+
+
+@pytest.mark.errors
+def test_one_layer_is_refused():
+    with pytest.raises(ShapeError, match="at least two layers"):
+        Gdm(
+            distance=torch.zeros(1, 4, 4, 6, 8), left=torch.zeros(1, 4, 4, 6, 8, dtype=torch.bool),
+            occupancy=torch.zeros(1, 4, 4), matter=torch.zeros(1, 4, 4, 10), h=0.1, cap=1.0,
+        )  # fmt: skip
