@@ -184,6 +184,7 @@ def test_debug_keeps_the_traceback():
     assert result.exit_code == 1
 
 
+@pytest.mark.slow
 def test_stopped_bake_leaves_nothing_half_written_and_goes_on(tmp_path):
     """SIGINT in the middle: status 130, no table; the same command then finishes it."""
     out = tmp_path / "a.btf.zarr"

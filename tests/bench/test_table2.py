@@ -34,6 +34,7 @@ def test_pictures_are_named_as_bonn_does(tmp_path, rng, monkeypatch):
         assert image.decode_codes(read(found.files[80, 80])).mean() < 0.5
 
 
+@pytest.mark.slow
 def test_a_fit_is_measured_in_a_process_of_its_own(tmp_path, rng, device):
     table2.write_table(base(rng), 6, tmp_path / "a.btf.zarr", Context())
     table2.drop(tmp_path / "a.btf.zarr")

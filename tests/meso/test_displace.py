@@ -44,7 +44,7 @@ def test_texture_area_is_kept():
     assert covered == pytest.approx(21, rel=1e-5)
 
 
-@pytest.mark.parametrize("name", ["brick", "weave", "sheet"])
+@pytest.mark.parametrize("name", ["brick", pytest.param("weave", marks=pytest.mark.slow), "sheet"])
 def test_no_cracks(name):
     """From outside, every ray well inside the outline of a closed body meets the mesostructure."""
     body = shapes.torus(tiles=(6, 2), triangles=1500)

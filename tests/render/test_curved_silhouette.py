@@ -32,7 +32,9 @@ def iou(a, b):
     return float((a & b).sum() / (a | b).sum())
 
 
-@pytest.mark.parametrize(("name", "tiles", "least"), [("brick", (3, 1), 0.9), ("weave", (6, 2), 0.88)])
+@pytest.mark.parametrize(
+    ("name", "tiles", "least"), [("brick", (3, 1), 0.9), pytest.param("weave", (6, 2), 0.88, marks=pytest.mark.slow)]
+)
 def test_closer_to_the_displaced_mesh_than_the_paper(name, tiles, least):
     body = shapes.torus(tiles=tiles, triangles=3000)
     paper, curved, truth = masks(body, generators.GENERATORS[name](), camera((0, 2.2, 3.2), size=200))

@@ -44,7 +44,7 @@ def test_endless_sheet_at_grazing_angles(rng):
     assert ((surface.position[:, :2] >= -1e-3) & (surface.position[:, :2] <= 1 + 1e-3)).all()
 
 
-@pytest.mark.parametrize("name", ["brick", "weave", "spheres", "groove"])
+@pytest.mark.parametrize("name", ["brick", pytest.param("weave", marks=pytest.mark.slow), "spheres", "groove"])
 def test_wrapping_equals_many_copies(name, rng):
     meso = generators.GENERATORS[name]()
     o, d = start(4000, rng), down(4000, rng, 80)
