@@ -1,3 +1,4 @@
+import pytest
 import torch
 
 from torchmeso.bench import table2
