@@ -22,7 +22,6 @@ from torchmeso.backends import BackendChoice
 from torchmeso.compress.double_sh import DoubleShOptions
 from torchmeso.compress.eigen import EigenOptions
 from torchmeso.compress.sh_pca import ShPcaOptions
-from torchmeso.data import height_field
 from torchmeso.errors import ConfigError, FormatError, MesoError, did_you_mean
 from torchmeso.geometry.camera import Camera, look_at
 from torchmeso.geometry.light import DirectionalLight, Light, PointLight, SpotLight
@@ -30,11 +29,10 @@ from torchmeso.geometry.mesh import Mesh
 from torchmeso.geometry.mesh_file import Finish
 from torchmeso.geometry.shapes import SHAPES
 from torchmeso.geometry.unwrap import UnwrapOptions
-from torchmeso.meso import mesostructure
 from torchmeso.meso.bake_btf import BtfOptions
 from torchmeso.meso.bake_mdf import MdfOptions
-from torchmeso.meso.generators import GENERATORS
 from torchmeso.meso.mesostructure import Mesostructure, Rgb
+from torchmeso.meso.sources import SOURCES
 from torchmeso.render.frame import FrameOptions
 from torchmeso.render.silhouette import Silhouette
 
@@ -45,53 +43,6 @@ class _Strict(BaseModel):
     """Frozen, and nothing but the known keys."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True, allow_inf_nan=False)
-
-
-def _from_pictures(
-    *,
-    displacement: str,
-    albedo: str | None = None,
-    h: float,
-    texels: int = 256,
-    roughness: float = 0.5,
-    f0: float = 0.0,
-    colour: Rgb | None = None,
-) -> Mesostructure:
-    """Height field from a displacement picture and a colour picture."""
-    field = height_field.from_pictures(displacement, albedo, h=h, texels=texels)
-    plain = colour or ((1.0, 1.0, 1.0) if albedo else (0.6, 0.6, 0.6))
-    return mesostructure.from_height_field(field, albedo=plain, roughness=roughness, f0=f0)
-
-
-def _from_scan(
-    *,
-    path: str,
-    relief: float | None = None,
-    texels: int = 256,
-    blend: float = 0.1,
-    colour: Rgb = (0.6, 0.6, 0.6),
-    roughness: float = 0.5,
-    f0: float = 0.0,
-) -> Mesostructure:
-    """Height field from a GelSight .tmd scan."""
-    field = height_field.from_tmd(path, relief=relief, texels=texels, blend=blend)
-    return mesostructure.from_height_field(field, albedo=colour, roughness=roughness, f0=f0)
-
-
-def _from_mesh(
-    *, path: str, h: float | None = None, colour: Rgb = (0.6, 0.6, 0.6), roughness: float = 0.5, f0: float = 0.0
-) -> Mesostructure:
-    """Any triangle tile that trimesh reads."""
-    return mesostructure.from_file(path, h=h, albedo=colour, roughness=roughness, f0=f0)
-
-
-SOURCES: dict[str, Callable[..., Mesostructure]] = {
-    **GENERATORS,
-    "pictures": _from_pictures,
-    "scan": _from_scan,
-    "mesh": _from_mesh,
-}
-"""What `meso.type` may be: the generators, and the readers of files."""
 
 
 class MesoConfig(BaseModel):
