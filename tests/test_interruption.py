@@ -113,7 +113,8 @@ def test_a_picture_on_a_full_disk(out, place):
     assert f"{out}: could not be written" in said
     assert "Traceback" not in said
     assert left(place, "warm.png") == []
-    assert not [p for p in place.iterdir() if ".part" in p.name]
+    # Pictures of a film wait for another try.
+    assert [p.name for p in place.iterdir() if ".part" in p.name] == ([f"{out}.part"] if frames else [])
 
 
 @pytest.mark.slow
