@@ -38,7 +38,7 @@ COUNTERS = (
     "used", "vectors", "slots", "tile", "crossing", "behind", "degenerate", "drawn", "fragments",
     "deepest", "covered", "intervals", "deep", "carved", "inside", "hidden", "looked", "spared", "empty",
     "beside", "turned", "losers", "bounded", "near_bodies", "averted", "kept",
-    "stamps", "asked",
+    "stamps", "asked", "prisms", "tets", "endless",
 )  # fmt: skip
 """What the kernels count, in the order of `Counters` in kernels_cl/render/rasterize.clh; padded to 32."""
 
