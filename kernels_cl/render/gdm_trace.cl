@@ -1,5 +1,5 @@
 // A list of rays through a shell.
-// Host: torchmeso/render/gdm_trace.py
+// Host: torchmeso/render/device_trace.py
 
 #include "render/gdm_trace.clh"
 
@@ -10,7 +10,7 @@ typedef struct {
 } Ray;
 typedef struct {
     float t, place[3], way[3];
-    int prism, hit, pad[7];  // hit: 1 material, 2 the bottom, 0 neither, -1 lost
+    int prism, hit, through, prisms, pad[5];  // through: THROUGH_*, 0 where there is material; prisms: -1 is lost
 } Answer;
 
 static INNER void trace_sixteen(__global const Ray *rays, const Shells *shells, __global const uchar *tables,
@@ -41,7 +41,9 @@ static INNER void trace_sixteen(__global const Ray *rays, const Shells *shells, 
         a->place[0] = u.lane[l], a->place[1] = v.lane[l], a->place[2] = z.lane[l];
         a->way[0] = wx.lane[l], a->way[1] = wy.lane[l], a->way[2] = wz.lane[l];
         a->prism = met.prism.lane[l];
-        a->hit = met.endless >> l & 1 ? -1 : met.floor >> l & 1 ? 2 : hit >> l & 1;
+        a->hit = hit >> l & 1;
+        a->through = met.through.lane[l];
+        a->prisms = met.endless >> l & 1 ? -1 : met.passed.lane[l];
     }
     atomic_add(counted, met.prisms);
     atomic_add(counted + 1, met.steps);

@@ -154,7 +154,3 @@ def matter_codes(gdm: Gdm) -> UInt16[np.ndarray, "voxel 16"]:
     whole[:, 3:10] = rows[:, 3:10]
     whole[:, 10] = 1
     return (whole.clamp(0, 1) * known[:, None] * 65535).round().numpy().astype(np.uint16)
-
-
-RAY = np.dtype([("origin", "f4", 3), ("direction", "f4", 3), ("entry", "i4"), ("pad", "i4")])
-ANSWER = np.dtype([("t", "f4"), ("place", "f4", 3), ("way", "f4", 3), ("prism", "i4"), ("hit", "i4"), ("pad", "i4", 7)])
