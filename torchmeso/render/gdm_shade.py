@@ -24,8 +24,9 @@ from torchmeso.render.scene import Scene, World
 from torchmeso.transport import materials
 from torchmeso.transport.materials import Reflectance
 
-LEAST_COS = 0.02
-"""Of the view: a normal averaged over voxels may lean away from a surface that is seen."""
+LEAST_COS, DEEPER = 0.02, 3.0
+"""Of the view: a normal averaged over voxels may lean away from a surface that is seen. And voxels that a point may lie
+below its surface."""
 
 
 class Met(NamedTuple):
@@ -130,14 +131,23 @@ def in_shade(
 ) -> Bool[Tensor, "n"]:
     """Return whether near material lies between points of a surface and a light; wang2004gdm, section 3.2.
 
-    Asked a voxel in front of the surface, where the table tells it from what is in front of it. Where there is a
-    `floor` light from below does not get through.
+    Asked a voxel in front of the surface, where the table tells it from what is in front of it; of points that lie
+    deeper, because a distance is interpolated, once more from farther out. Where there is a `floor` light from below
+    does not get through.
     """
     layers, height, width = gdm.voxels
-    start = place + max(1 / width, 1 / height, gdm.h / (layers - 1)) * normal
+    voxel = max(1 / width, 1 / height, gdm.h / (layers - 1))
+    blocked, within = _asked(gdm, place + voxel * normal, wi)
+    if bool(within.any()):
+        blocked[within] = _asked(gdm, (place + DEEPER * voxel * normal)[within], wi[within])[0]
+    return blocked | (wi[:, 2] <= 0) if floor else blocked
+
+
+def _asked(gdm: Gdm, start: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:
+    """Return whether there is material ahead, and whether the start lies inside of it; above the slab is none."""
     found = gdm.evaluate(start, wi)
-    below = wi[:, 2] <= 0
-    return torch.where(start[:, 2] >= 0, below, ~found.left | below) if floor else ~found.left & (start[:, 2] < 0)
+    below = start[:, 2] < 0
+    return ~found.left & below, (found.distance <= 0) & ~found.left & below
 
 
 def _matter(gdm: Gdm, met: Met, albedo: tuple[float, float, float]) -> Matter:
