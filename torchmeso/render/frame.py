@@ -162,7 +162,7 @@ def _develop(
         depths = torch.tensor([0.0 if m.gdm is None else m.gdm.h for m in scene.surfaces], dtype=dtype)
         dark = _blocked(scene, maps, shell_points.position, depths[shell_points.owner] * shell_points.scale)
         shadowed[:, met.pixel] = dark
-        rgb[met.pixel] = gdm_shade.shade(scene, shell_points, -direction, dark)
+        rgb[met.pixel] = gdm_shade.shade(scene, shell_points, -direction, dark, shadows=options.shadows)
 
     size = (camera.height, camera.width)
     return {

@@ -83,7 +83,12 @@ def points(
 
 
 def shade(
-    scene: Scene, met: Met, wo_world: Float[Tensor, "n 3"], shadowed: Bool[Tensor, "light n"]
+    scene: Scene,
+    met: Met,
+    wo_world: Float[Tensor, "n 3"],
+    shadowed: Bool[Tensor, "light n"],
+    *,
+    shadows: bool = True,
 ) -> Float[Tensor, "n 3"]:
     """Return the linear RGB radiance of `met` towards `wo_world`.
 
@@ -92,6 +97,7 @@ def shade(
         met: where.
         wo_world: (n, 3) unit, to the viewer.
         shadowed: (light, n) whether a light is blocked by what is far.
+        shadows: whether near material casts shadows.
     """
     total = torch.zeros_like(met.position)
     for i, dressing in enumerate(scene.surfaces):
@@ -110,11 +116,12 @@ def shade(
             wi = frames.to_local(own.frame, wi_world)
             faces = dot(matter.normal, wi) > 0
             arrives = (~blocked[mine] & faces & (E.amax(-1) > 0)).nonzero()[:, 0]
-            near = in_shade(
-                dressing.gdm, own.place[arrives], matter.normal[arrives], wi[arrives],
-                floor=dressing.shell.base == "solid",
-            )  # fmt: skip
-            arrives = arrives[~near]
+            if shadows:
+                near = in_shade(
+                    dressing.gdm, own.place[arrives], matter.normal[arrives], wi[arrives],
+                    floor=dressing.shell.base == "solid",
+                )  # fmt: skip
+                arrives = arrives[~near]
             lit[arrives] = True
             to_light = frames.to_local(Frame(*(x[arrives] for x in around)), wi[arrives])
             parts = Reflectance(matter.albedo[arrives], matter.alpha[arrives], matter.f0[arrives])
