@@ -270,7 +270,16 @@ static Seen look(const Place *place, const Rays *rays, __global const float16 *k
         if (!candidates) break;
         int hit = candidates;
         const float16 length = found.t_back.vector - found.t_front.vector;
-        Surface s = surface_at(place, rays, candidates & ~found.inside, found.front);
+#ifdef GDM
+        Met met;
+        int entering;
+        const int missed = pass_shells(place, rays, candidates & ~found.inside, &found, &met, &entering, tally);
+        Surface s = surface_at(place, rays, candidates & ~found.inside & ~entering, found.front);
+        hit &= ~missed;
+        entering &= hit;
+#else
+        const Surface s = surface_at(place, rays, candidates & ~found.inside, found.front);
+#endif
         const float16 t = found.t_front.vector;
         Vector3 position = {rays->origin.x + t * rays->direction.x, rays->origin.y + t * rays->direction.y,
                             rays->origin.z + t * rays->direction.z};
@@ -290,12 +299,6 @@ static Seen look(const Place *place, const Rays *rays, __global const float16 *k
         const int thin = thin_lanes(place, rays, candidates & ~found.inside & ~found.single, &found, &s, 0, 1, tally);
         hit &= ~thin;
         if (thin) hit |= test_silhouette(place, rays, thin, &found, &s, 1, thin & ~deep, &at, &reach, tally);
-#endif
-#ifdef GDM
-        Met met;
-        int entering;
-        hit &= ~pass_shells(place, rays, candidates & ~found.inside, &found, &met, &entering, tally);
-        entering &= hit;
 #endif
         tally->carved += __builtin_popcount(candidates & ~hit);
         tally->inside += __builtin_popcount(hit & found.inside);

@@ -55,9 +55,13 @@ def upload_geometry(world: World) -> DeviceGeometry:
     Raises:
         BackendError: there is no device.
     """
+    dressed = torch.zeros(len(world.object), dtype=torch.bool)
+    dressed[[s.surface for s in world.shells]] = True  # shells are left through faces that nobody asks for
+    number = world.object[world.owner]
+    number = torch.where(dressed[world.owner], ~number, number)
     tag = (world.component << 2) | (world.closed[world.component].long() << 1)
     return DeviceGeometry(
-        upload_mesh(world.vertices, world.faces, torch.stack([tag, world.object[world.owner]], 1)),
+        upload_mesh(world.vertices, world.faces, torch.stack([tag, number], 1)),
         opencl.upload(vertex_records(world)),
         opencl.upload(face_records(world, torch.stack([tag, world.owner], 1))),
     )

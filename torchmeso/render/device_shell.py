@@ -24,8 +24,8 @@ PRISM = np.dtype(
     + [("base", "f4"), ("rest", "f4", 5)]
 )
 
-MOST_TETS = 1 << 22
-"""As many as a code of 31 bits can name."""
+MOST_TETS = (1 << 22) - 1
+"""As many as a code can name that is not one of the boundary's."""
 
 
 class DeviceShells(NamedTuple):
@@ -84,8 +84,11 @@ def _ahead(shell: Shell, first_tet: int) -> Int[Tensor, "T 4"]:
     behind = 6 - there.sum(1)
     corners = (there << (2 * face)).sum(1) | (behind << (2 * corner))
     crossing = (other // 3 != tet // 3).long() << 8
+    places = shell.uvz[tet[:, None], face], shell.uvz[other[:, None], there]
+    seam = (places[0] != places[1]).any(-1).any(-1).long() << 9
     codes = shell.neighbour.clone()
-    codes[tet, corner] = (other + first_tet) << 9 | crossing | corners
+    code = (other + first_tet) << 10 | seam | crossing | corners
+    codes[tet, corner] = torch.where(code >= 1 << 31, code - (1 << 32), code)  # all 32 bits are used
     return codes
 
 
