@@ -5,9 +5,8 @@ import math
 import pytest
 import torch
 
-from torchmeso.data import textile
 from torchmeso.data.textile import Textile, Yarn
-from torchmeso.data.yarn_section import Ellipse, Rectangle
+from torchmeso.data.yarn_section import Ellipse
 from torchmeso.errors import FormatError, ShapeError
 
 ROUND = Ellipse(width=0.2, height=0.1)
@@ -122,7 +121,7 @@ def test_paths_without_a_frame_and_long_ones_are_refused():
         make([[0, 0, 0], [0, 0, 1]], periodic=False).rings(0.1, 8)
     with pytest.raises(FormatError, match="at every place, got one along it, or a cusp"):
         make([[0, 0, 0], [1, 0, 0], [0, 0, 0]], path="linear", periodic=False).rings(0.1, 8)
-    with pytest.raises(FormatError, match="expected at most 65536 rings, got 1e.06"):
+    with pytest.raises(FormatError, match=r"expected at most 65536 rings, got 1e\+06"):
         make([[0, 0, 0], [1e3, 0, 0]]).rings(1e-3, 8)
     with pytest.raises(FormatError, match="textile: expected at least one yarn"):
         Textile(yarns=())
@@ -130,5 +129,3 @@ def test_paths_without_a_frame_and_long_ones_are_refused():
         Textile(yarns=(make([[0, 0, 0], [1, 0, 0]]),), domain=torch.tensor([[0.0, 0.0], [0.0, 1.0]]))
     with pytest.raises(ShapeError, match=r"yarn\.ups"):
         make([[0, 0, 0], [1, 0, 0]], ups=torch.ones(3, 3))
-    assert textile.MOST_RINGS == 65536
-    assert Rectangle(width=1, height=1).width == 1

@@ -46,7 +46,7 @@ def read(path: str | Path) -> Textile:
     try:
         return _textile(top)
     except MesoError as error:
-        raise FormatError(f"{path}: {error}") from error
+        raise FormatError(f"{path}: {' '.join(str(error).split())}") from error
 
 
 def _textile(top: Element) -> Textile:

@@ -83,6 +83,14 @@ class Yarn:
         """From the first node to the last."""
         return self.nodes[-1] - self.nodes[0]
 
+    def count(self, step: float) -> int:
+        """Return the number of rings at a distance of `step`.
+
+        Raises:
+            FormatError: the yarn is too long for `step`.
+        """
+        return int(self._pieces(step).sum()) + 1
+
     def rings(self, step: float, segments: int) -> Float[Tensor, "ring {segments} 3"]:
         """Return the outlines along the yarn, from its first node to its last, each closed.
 
@@ -93,10 +101,7 @@ class Yarn:
         Raises:
             FormatError: the yarn is too long for `step`, or an `up` lies along the path.
         """
-        knots = self._knots()
-        pieces = np.ceil(np.diff(knots) / step).clip(2)
-        if not pieces.sum() <= MOST_RINGS:
-            raise FormatError(f"yarn: expected at most {MOST_RINGS} rings, got {pieces.sum():.4g}; it is too long")
+        knots, pieces = self._knots(), self._pieces(step)
         at = [np.linspace(a, b, int(n), endpoint=False) for a, b, n in zip(knots, knots[1:], pieces, strict=False)]
         u = np.append(np.concatenate(at), knots[-1])
         point, tangent = (torch.from_numpy(x) for x in self._trace(knots, u))
@@ -109,6 +114,13 @@ class Yarn:
         up = torch.linalg.cross(right, tangent)
         outline = self._outlines(knots, u, point, segments)
         return point[:, None] + outline[..., :1] * right[:, None] + outline[..., 1:] * up[:, None]
+
+    def _pieces(self, step: float) -> np.ndarray:
+        """Return how many pieces the path has from each node to the next."""
+        pieces = np.ceil(np.diff(self._knots()) / step).clip(2)
+        if not pieces.sum() <= MOST_RINGS:
+            raise FormatError(f"yarn: expected at most {MOST_RINGS} rings, got {pieces.sum():.4g}; it is too long")
+        return pieces
 
     def _knots(self) -> np.ndarray:
         return np.append(0.0, self.nodes.double().diff(dim=0).norm(dim=-1).cumsum(0).numpy())

@@ -61,6 +61,7 @@ def from_tg3(
         FormatError: the file is missing or unreadable.
         GeometryError: the textile has no period that makes a tile.
         ConfigError: `colours` are not as many as yarns, or a dial is out of range.
+        SizeError: the tile would have too many triangles.
     """
     textile = texgen.read(path)
     if colours is not None:
@@ -91,7 +92,8 @@ def from_textile(
         segments: facets around a yarn.
 
     Raises:
-        GeometryError: there is no period that makes a tile, or the yarns are deeper than `h`.
+        GeometryError: there is no period that makes a tile.
+        ConfigError: the yarns are deeper than `h`, or a dial is out of range.
         SizeError: the tile would have too many triangles.
     """
     check_range("textile.along", along, 2, 4096)
@@ -103,16 +105,13 @@ def from_textile(
             f"x and y are scaled apart by {tile.anisotropy:.3g}",
             stacklevel=2,
         )
+    step, shifts = float(tile.sides.min()) / along, [copies(yarn, tile) for yarn in textile.yarns]
+    quads = sum(len(s) * yarn.count(step) * segments for yarn, s in zip(textile.yarns, shifts, strict=True))
+    check_memory("textile", 400.0 * quads, MEMORY_LIMIT, "lower along or segments")
     found: list[tuple[Float[Tensor, "ring around 3"], bool, int]] = []
-    triangles = 0
     for k, yarn in enumerate(textile.yarns):
-        rings = (
-            yarn.rings(float(tile.sides.min()) / along, segments) - torch.nn.functional.pad(tile.low, (0, 1))
-        ) / tile.unit
-        shifts = copies(yarn, tile)
-        triangles += 2 * len(shifts) * rings.shape[0] * segments
-        check_memory("textile", 200.0 * triangles, MEMORY_LIMIT, "lower along or segments")
-        found += [(rings + shift, goes_on(yarn, tile), k) for shift in shifts]
+        rings = (yarn.rings(step, segments) - torch.nn.functional.pad(tile.low, (0, 1))) / tile.unit
+        found += [(rings + shift, goes_on(yarn, tile), k) for shift in shifts[k]]
     top = max(float(rings[..., 2].max()) for rings, _, _ in found)
     parts = []
     for rings, open_ended, k in found:
@@ -120,7 +119,10 @@ def from_textile(
         if open_ended:
             rings = torch.cat([rings[:-1], rings[:1] + (textile.yarns[k].way / tile.unit).round(decimals=12)])
         parts.append((_surface((rings * STEPS).round().div(STEPS).float(), open_ended), k))
-    depth = max(-float(vertices[:, 2].min()) for (vertices, _), _ in parts) if h is None else h
+    depth = max(-float(vertices[:, 2].min()) for (vertices, _), _ in parts)
+    if h is not None:
+        check_range("textile.h", h, depth, 10)
+        depth = h
     if backing:
         parts.append((floor(depth), len(coats)))
     return assemble(parts, palette(*coats, DARK), depth)

@@ -17,7 +17,7 @@ from torch import Tensor
 from torchmeso.data.textile import Textile, Yarn
 from torchmeso.errors import GeometryError
 
-MOST_REPEATS = 64
+MOST_REPEATS = 32
 """How many of a yarn's own repeats are looked through for the period of the tile."""
 
 MOST_PERIODS = 8
@@ -80,7 +80,7 @@ def copies(yarn: Yarn, tile: Tile) -> list[Float[Tensor, "3"]]:
     place = found / tile.sides
     place = (place + 1e-6) % 1 - 1e-6
     steps = (place * 1e5).round().long() % 100000
-    _, first = torch.unique(steps, dim=0, return_inverse=True)
+    _, first = torch.unique(steps[:, 0] * 100000 + steps[:, 1], return_inverse=True)
     if not count < MOST_REPEATS**2 / 4 or int(first.max()) + 1 != round(count) or abs(count - round(count)) > 1e-3:
         raise GeometryError(
             f"textile: expected yarns whose repeats fill the tile evenly, got {count:.4g} copies of one; "
@@ -164,7 +164,7 @@ def _common(periods: list[float]) -> float | None:
 
 def _is_multiple(length: float, period: float) -> bool:
     times = length / period
-    return times > 0.5 and abs(times - round(times)) < 1e-5 * times
+    return 0.5 < times < 1e9 and abs(times - round(times)) < 1e-5 * times
 
 
 def _square(x: float, y: float) -> tuple[int, int]:
