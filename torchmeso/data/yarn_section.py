@@ -12,7 +12,7 @@ Test: tests/data/test_yarn_section.py
 import math
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -24,6 +24,7 @@ MOST = 1e6
 """Longest side of a section in the file's units; nothing woven comes near."""
 
 
+@runtime_checkable
 class Section(Protocol):
     """A closed outline."""
 
