@@ -89,6 +89,18 @@ def test_sections_that_change_fill_their_mean_area(tmp_path, rng):
     assert float(found.float().mean()) == pytest.approx(math.pi / 4 * 0.6 * 0.4 / 0.4, abs=0.015)
 
 
+def test_a_yarn_wider_than_the_tile_overlaps_its_copies(tmp_path, rng):
+    section = tg3.section({"type": "CSectionEllipse", "Width": 1.6, "Height": 0.4})
+    meso = build(tmp_path, tg3.textile([tg3.straight(sections=tg3.constant(section))]), segments=128)
+    place = torch.rand(4000, 3, generator=rng) * torch.tensor([1.0, 1.0, -meso.h])
+    truth, sure = torch.zeros(4000, dtype=torch.bool), torch.ones(4000, dtype=torch.bool)
+    for k in (-1, 0, 1):
+        gap = ((place[:, 1] - 0.5 - k) / 0.8) ** 2 + ((place[:, 2] + 0.2) / 0.2) ** 2
+        truth |= gap < 1
+        sure &= (gap - 1).abs() > 2e-2
+    assert torch.equal(RayCastGdm(meso, 0.5).inside(place)[sure], truth[sure])
+
+
 def test_moving_the_domain_moves_the_tile(tmp_path, rng):
     """Distances do not know where the border lies, nor do the insides."""
     uv, wo = looks(rng, 75)

@@ -3,8 +3,7 @@
 The sides of the tile (`meso.textile_period`) become 1 along u and v; z is scaled by the mean of both.
 
 A yarn that goes on in its own copy is an open tube whose last ring is the first one of that copy, so that
-`meso.solid` joins them through the tile's border; other yarns are closed at both ends. A yarn that cuts into a copy of
-itself in the next tile is not told from a hollow one there.
+`meso.solid` joins them through the tile's border; other yarns are closed at both ends.
 
 Test: tests/meso/test_textile.py
 """
