@@ -27,7 +27,6 @@ from torch import Tensor
 
 from torchmeso.geometry.directions import from_angles
 from torchmeso.geometry.rays import RayScene
-from torchmeso.transport import tracer
 from torchmeso.transport.tracer import Geometry
 
 VOTES, TILT_DEG = 5, 17.0
@@ -92,13 +91,14 @@ class Solids:
 
     def __init__(self, geometry: Geometry, h: float):
         """Find the bodies, and build a scene for each set of them that cannot touch."""
-        reach = h * math.tan(math.radians(TILT_DEG)) + 1e-3
         of_tile = bodies(geometry, h)
-        vertices, _, source = tracer.unit_cell(geometry.vertices, geometry.faces, reach)
-        corner, source = vertices.reshape(-1, 3, 3)[of_tile[source] >= 0], source[of_tile[source] >= 0]
-        here = Corners(*(x[source.numpy()] for x in _corners(geometry, h)))
-        body = _apart(corner, geometry.vertices[geometry.faces[source]], here, of_tile[source].numpy())
-        corner, body = corner[body >= 0], body[body >= 0]
+        closed = (of_tile >= 0).nonzero()[:, 0]
+        tile = geometry.vertices[geometry.faces[closed]]
+        shifts, near = _copies(tile, h * math.tan(math.radians(TILT_DEG)) + 1e-3)
+        body = _apart(_corners(geometry, h), closed.numpy(), of_tile.numpy(), shifts)
+        asked = near.flatten() & torch.from_numpy(body >= 0)
+        corner = (tile + torch.nn.functional.pad(shifts, (0, 1))[:, None, None]).reshape(-1, 3, 3)[asked]
+        body = body[asked.numpy()]
         self._scenes: list[tuple[RayScene, Tensor]] = []
         for members in _sets(corner, body):
             mine = torch.from_numpy(np.isin(body, members))
@@ -178,27 +178,45 @@ def _split(
     return np.unique(np.where(whole[part], part, fine + len(whole)), return_inverse=True)[1].reshape(-1)
 
 
+def _copies(tile: Float[Tensor, "F 3 3"], reach: float) -> tuple[Int[Tensor, "k 2"], Bool[Tensor, "k F"]]:
+    """Return the moves by whole tiles that bring a triangle within reach of the unit cell, and which they bring."""
+    if not len(tile):
+        return torch.zeros(0, 2, dtype=torch.long), torch.zeros(0, 0, dtype=torch.bool)
+    low, high = tile[..., :2].amin(1), tile[..., :2].amax(1)
+    first, last = (-(high.amax(0) + reach).floor()).long(), (1 - (low.amin(0) - reach).floor()).long()
+    ranges = [torch.arange(int(a), int(b) + 1) for a, b in zip(first, last, strict=True)]
+    shifts = torch.cartesian_prod(*ranges)
+    near = torch.stack([((low + s <= 1 + reach) & (high + s >= -reach)).all(-1) for s in shifts])
+    used = near.any(1)
+    return shifts[used], near[used]
+
+
 def _apart(
-    corner: Float[Tensor, "G 3 3"], original: Float[Tensor, "G 3 3"], corners: Corners, body: Int[np.ndarray, "G"]
-) -> Int[np.ndarray, "G"]:
-    """Return the bodies of triangles around the tile, copies being others, -1 for walls that one has twice."""
-    shift = np.rint((corner - original)[..., :2].numpy()).astype(np.int64)
-    cell = corners.cell + shift
-    cell -= cell.min((0, 1), initial=0)
-    width = int(cell.max(initial=0)) + 1
-    key = ((corners.place * width + cell[..., 0]) * width + cell[..., 1]) * (body.max(initial=0) + 1) + body[:, None]
+    corners: Corners, closed: Int[np.ndarray, "G"], of_tile: Int[np.ndarray, "F"], shifts: Int[Tensor, "k 2"]
+) -> Int[np.ndarray, "kG"]:
+    """Return the bodies of copies of the closed triangles, others in every copy, -1 for walls that one has twice.
+
+    Copies are whole here, even where most of one is out of reach: cut ones would fall apart.
+    """
+    cell = (corners.cell[closed] + shifts.numpy()[:, None, None]).reshape(-1, 3, 2)
+    if not len(cell):
+        return np.zeros(0, np.int64)
+    place, of = (np.tile(x, (len(shifts), *(1,) * (x.ndim - 1))) for x in (corners.place[closed], of_tile[closed]))
+    cell -= cell.min((0, 1))
+    width = int(cell.max()) + 1
+    key = ((place * width + cell[..., 0]) * width + cell[..., 1]) * (of.max() + 1) + of[:, None]
     number = np.unique(key, return_inverse=True)[1].reshape(-1, 3)
     of = _connected(number)
     _, same, count = np.unique(np.sort(number, 1), axis=0, return_inverse=True, return_counts=True)
     twice = (count % 2 == 0)[same.reshape(-1)]
-    once = np.zeros(of.max(initial=0) + 1, bool)
+    once = np.zeros(of.max() + 1, bool)
     once[of[~twice]] = True
     return np.where(twice & once[of], -1, of)
 
 
 def _connected(corner: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, "F"]:
     """Return the part that each triangle belongs to by the numbers of its corners."""
-    ends, n = np.concatenate([corner[:, [0, 1]], corner[:, [1, 2]]]), int(corner.max(initial=0)) + 1
+    ends, n = np.concatenate([corner[:, [0, 1]], corner[:, [1, 2]]]), int(corner.max()) + 1
     graph = coo_matrix((np.ones(len(ends), np.int8), (ends[:, 0], ends[:, 1])), shape=(n, n))
     part = connected_components(graph, directed=False)[1]
     return np.unique(part[corner[:, 0]], return_inverse=True)[1].reshape(-1)
