@@ -10,7 +10,7 @@ import torch
 import yaml
 from click.testing import CliRunner
 
-from tests.data import bonn
+from tests.data import bonn, tg3
 from tests.pipeline.small import CONTENT
 from torchmeso.backends import opencl
 from torchmeso.cli import main
@@ -55,6 +55,16 @@ def test_info_without_a_platform_says_what_to_do(monkeypatch):
 def test_info_on_a_file(small):
     assert "objects: torus (brick), plane (clay)" in run("info", small).stdout
     assert json.loads(run("info", small, "--json").stdout)["picture"] == "48 x 36"
+
+
+def test_a_weave_file_is_baked(tmp_path):
+    path = tmp_path / "a.tg3"
+    path.write_bytes(tg3.textile([tg3.straight(0), tg3.straight(1, z=0.2)]))
+    for suffix, dials in ((".gdm.zarr", ("--layers", 4)), (".mdf.zarr", ("--views", "grid(6, 3, 80)"))):
+        out = tmp_path / f"a{suffix}"
+        result = run("bake", "--meso", path, "--out", out, "--texels", 8, *dials)
+        assert result.exit_code == 0, result.output
+        assert "'type': 'textile'" in run("info", out).stdout
 
 
 def test_from_a_mesostructure_to_a_model(tmp_path):
@@ -141,6 +151,7 @@ REFUSED = [
     (["bake"], "give a CONFIGURATION or --meso"),
     (["bake", "--meso", "brick"], "--meso needs --out"),
     (["bake", "--meso", "brik", "--out", "x.btf.zarr"], "got 'brik'; did you mean 'brick'?"),
+    (["bake", "--meso", "no.tg3", "--out", "x.btf.zarr"], "no.tg3: expected a file, found none"),
     (["bake", "--meso", "brick", "--out", "x.btf"], "expected a name that ends in .btf.zarr, .mdf.zarr or .gdm.zarr"),
     (["bake", "--meso", "brick", "--out", "x.mdf.zarr", "--samples", "4"], "MDF tables have no --samples"),
     (["bake", "--meso", "brick", "--out", "x.btf.zarr", "--texels", "999999"], "the limit is 64.0 GiB; lower"),

@@ -64,6 +64,14 @@ def test_mesostructure_takes_its_generators_arguments():
     assert meso.files == [Path("/somewhere/d.png")]
 
 
+def test_a_name_is_a_generator_or_a_file(monkeypatch, tmp_path):
+    monkeypatch.setenv("TORCHMESO_DATA", str(tmp_path))
+    assert config.meso_called("brick").type == "brick"
+    weave = config.meso_called("data:volume/a.TG3")
+    assert (weave.type, weave.files) == ("textile", [tmp_path / "volume" / "a.TG3"])
+    assert config.meso_called("b.obj").arguments == {"path": "b.obj"}
+
+
 def test_objects_are_scaled_then_turned_then_moved():
     item = ObjectConfig(shape="sphere", material="x", scale=2, rotate_deg=(0, 90, 0), translate=(1, 0, 0))
     moved = item.matrix() @ torch.tensor([1.0, 0, 0, 1], dtype=torch.float64)
@@ -163,6 +171,8 @@ def test_values_without_sense_are_refused():
         config.build_meso({"type": "brick", "rows": "many"})
     with pytest.raises(ConfigError, match="got 'brik'"):
         config.build_meso({"type": "brik"})
+    with pytest.raises(ConfigError, match=r"meso: expected a mesostructure, got 'weave\.xml'"):
+        config.meso_called("weave.xml")
 
 
 @pytest.mark.errors

@@ -24,6 +24,9 @@ from torchmeso.errors import ConfigError, MesoError, StorageError
 MESOS = "sheet, groove, spheres, brick, blocks, grid, weave, pipes, chain, grass, squama, peanut, bark"
 """The built-in mesostructures, said here so that help does not wait for torch."""
 
+FILES = "weave (.tg3), height scan (.tmd), triangle tile (.obj, .ply, .stl, .off)"
+"""The files that hold one."""
+
 
 class _Group(click.Group):
     """A click group that prints our errors as one sentence and leaves with status 2."""
@@ -80,7 +83,7 @@ def demo(out: str) -> None:
 
 @main.command()
 @click.argument("configuration", required=False)
-@click.option("--meso", help=f"Mesostructure to bake alone: {MESOS}.")
+@click.option("--meso", help=f"Mesostructure to bake alone: {MESOS}; or a file: {FILES}.")
 @click.option("--out", help="With --meso the table (.btf.zarr, .mdf.zarr, .gdm.zarr), else a folder; none = the cache.")
 @click.option("--texels", type=int, help="Side of the texture (default 64 for a BTF and a GDM, 256 for an MDF).")
 @click.option("--lights", help="Light directions of a BTF [grid(12, 5, 80)].")
@@ -128,6 +131,7 @@ def _bake_one(meso: str, out: Any, force: bool, options: dict[str, Any]) -> None
     from torchmeso.meso.bake_btf import BtfOptions
     from torchmeso.meso.bake_gdm import GdmOptions
     from torchmeso.meso.bake_mdf import MdfOptions
+    from torchmeso.pipeline import bake as bakes
 
     kinds = {
         ".btf.zarr": ("BTF", BtfOptions, bake_btf.bake, {"texels", "lights", "views", "samples", "bounces"}),
@@ -141,8 +145,11 @@ def _bake_one(meso: str, out: Any, force: bool, options: dict[str, Any]) -> None
     wrong = set(options) - known
     if wrong:
         raise ConfigError(f"bake: {kind} tables have no --{min(wrong)}; their dials are --{', --'.join(sorted(known))}")
-    tile = config.build_meso({"type": meso})
+    source = config.meso_called(meso)
+    tile = source.build()
     about: dict[str, object] = {"source": {"type": meso}}
+    if source.files:
+        about["source"] = {"type": source.type, "path": meso, "hash": bakes.file_hash(source.files[0])}
     _refuse_to_replace(out, force)
     with _progress() as report:
         job(tile, dials(**options), out, about=about, progress=lambda x: report(f"{meso}: {kind}", x))

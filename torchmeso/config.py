@@ -33,7 +33,7 @@ from torchmeso.meso.bake_btf import BtfOptions
 from torchmeso.meso.bake_gdm import GdmOptions
 from torchmeso.meso.bake_mdf import MdfOptions
 from torchmeso.meso.mesostructure import Mesostructure, Rgb
-from torchmeso.meso.sources import SOURCES
+from torchmeso.meso.sources import SOURCES, SUFFIXES
 from torchmeso.render.frame import FrameOptions
 from torchmeso.render.scene import ShellOptions
 from torchmeso.render.silhouette import Silhouette
@@ -390,6 +390,20 @@ def build_meso(content: dict[str, Any]) -> Mesostructure:
     """
     try:
         return MesoConfig.model_validate(content).build()
+    except ValidationError as error:
+        raise ConfigError(f"meso: {_first_problem(error)}") from error
+
+
+def meso_called(name: str) -> MesoConfig:
+    """Return the mesostructure that a command line names: a generator, or a file by its suffix (`data:` allowed).
+
+    Raises:
+        ConfigError: there is none of that name.
+    """
+    reader = SUFFIXES.get(Path(name).suffix.lower())
+    content = {"type": name} if reader is None else {"type": reader, "path": _absolute(name, Path())}
+    try:
+        return MesoConfig.model_validate(content)
     except ValidationError as error:
         raise ConfigError(f"meso: {_first_problem(error)}") from error
 

@@ -2,11 +2,11 @@ import torch
 
 from torchmeso.data import image
 from torchmeso.meso.generators import GENERATORS
-from torchmeso.meso.sources import SOURCES
+from torchmeso.meso.sources import SOURCES, SUFFIXES
 
 
 def test_every_generator_is_a_source():
-    assert set(SOURCES) == {*GENERATORS, "pictures", "scan", "mesh"}
+    assert set(SOURCES) == {*GENERATORS, "pictures", "scan", "mesh", "textile"}
 
 
 def test_pictures_become_a_height_field(tmp_path):
@@ -21,6 +21,11 @@ def test_pictures_become_a_height_field(tmp_path):
     )
     assert coloured.geometry.albedo_map is not None
     assert torch.allclose(coloured.geometry.palette.albedo, torch.ones(1, 3))
+
+
+def test_a_suffix_names_a_reader_of_files():
+    assert set(SUFFIXES.values()) <= set(SOURCES)
+    assert SUFFIXES[".tg3"] == "textile"
 
 
 def test_a_mesh_file_is_moved_to_the_top_of_the_slab(tmp_path):

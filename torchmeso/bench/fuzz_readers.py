@@ -29,6 +29,7 @@ from torchmeso.data.btf import Btf
 from torchmeso.data.rti import LightSet
 from torchmeso.errors import MesoError
 from torchmeso.geometry import hemisphere
+from torchmeso.meso import textile
 from torchmeso.pipeline.bake import open_model
 
 SET = hemisphere.grid(5, 2, 70)
@@ -151,8 +152,39 @@ def _table() -> Btf:
     return Btf(images=torch.rand(10, 10, 3, 4, 3, generator=torch.Generator().manual_seed(0)), lights=SET, views=SET)
 
 
+WEAVE_HEAD = '<TexGenModel version="3.0.3"><Textile type="'
+
+YARN = (
+    WEAVE_HEAD + 'CTextile"><Domain type="CDomainPlanes"><Plane Normal="1, 0, 0" d="0" />'
+    '<Plane Normal="-1, 0, 0" d="-2" />'
+    '<Plane Normal="0, 1, 0" d="0" /><Plane Normal="0, -1, 0" d="-2" /></Domain><Yarn index="0">'
+    '<Interpolation Periodic="1" type="CInterpolationBezier" /><YarnSection type="CYarnSectionInterpNode" Ramped="0">'
+    '<Section type="CSectionPowerEllipse" Width="0.4" Height="0.2" Power="0.5" /><Section type="CSectionRotated" '
+    'Angle="0.2"><Section type="CSectionLenticular" Width="0.4" Height="0.2" Distortion="0.01" /></Section>'
+    "</YarnSection>"
+    '<Repeat value="2, 0, 0" /><Repeat value="0, 1, 0" /><MasterNode index="0" Position="0, 0.5, 0" Up="0, 0, 1" />'
+    '<MasterNode index="1" Position="2, 0.5, 0" Tangent="1, 0, 0" Up="0, 0, 1" /></Yarn></Textile></TexGenModel>'
+)
+PATTERN = (
+    WEAVE_HEAD + 'CTextileWeave2D" NumXYarns="1" NumYYarns="1" FabricThickness="0.4"><PatternCell x="0" y="0">'
+    '<PatternElement value="1" /><PatternElement value="0" /></PatternCell>'
+    '<XYarnData index="0" Width="0.8" Height="0.2" Spacing="1" /><YYarnData index="0" Width="0.8" Height="0.2" '
+    'Spacing="1" /></Textile></TexGenModel>'
+)
+
+
+def weaves(folder: Path) -> Files:
+    """A yarn through nodes, and a pattern."""
+
+    def read(path: Path) -> None:
+        textile.from_tg3(path=str(path), along=4, segments=4)
+
+    return {"yarn.tg3": (YARN.encode(), read), "pattern.tg3": (PATTERN.encode(), read)}
+
+
 FAMILIES: dict[str, Callable[[Path], Files]] = {
     "bonn": bonn, "pictures": pictures, "sets": sets, "relighting": relighting, "harmonics": harmonics,
+    "weaves": weaves,
 }  # fmt: skip
 
 

@@ -8,7 +8,6 @@ What is solid is found out by `meso.solid`.
 Test: tests/meso/test_bake_gdm.py
 """
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -93,14 +92,13 @@ class RayCastGdm:
     def __init__(self, meso: Mesostructure, cap: float):
         """Build the acceleration structure over the tile and its copies as far as `cap` reaches."""
         self.h, self.cap, self._geometry = meso.h, cap, meso.geometry
-        self._reach = max(cap, meso.h * math.tan(math.radians(solid.TILT_DEG))) + 2 * BEHIND
         self._vertices, self._faces, self._source = tracer.unit_cell(
-            meso.geometry.vertices, meso.geometry.faces, self._reach
+            meso.geometry.vertices, meso.geometry.faces, cap + 2 * BEHIND
         )
         a, b, c = self._vertices[self._faces].double().unbind(1)
         self._normal = normalize(torch.linalg.cross(b - a, c - a)).float()
         self._scene = RayScene(self._vertices, self._faces)
-        self._body = solid.bodies(meso.geometry, meso.h)[self._source]
+        self._solids = solid.Solids(meso.geometry, meso.h)
         self._divides = self._point_outwards(meso.geometry)[self._source]
 
     def cast(
@@ -140,7 +138,7 @@ class RayCastGdm:
 
     def inside(self, place: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
         """Return which points lie inside of at least one body."""
-        return solid.inside(self._scene, self._body, self._home(place), start=BEHIND)
+        return self._solids.inside(self._home(place), start=BEHIND)
 
     def matter(
         self, place: Float[Tensor, "n 3"], w: Float[Tensor, "n 3"], t: Float[Tensor, "n"], face: Int[Tensor, "n"]

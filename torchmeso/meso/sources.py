@@ -6,7 +6,7 @@ Test: tests/meso/test_sources.py
 from collections.abc import Callable
 
 from torchmeso.data import height_field
-from torchmeso.meso import mesostructure
+from torchmeso.meso import mesostructure, textile
 from torchmeso.meso.generators import GENERATORS
 from torchmeso.meso.mesostructure import Mesostructure, Rgb
 
@@ -54,5 +54,9 @@ SOURCES: dict[str, Callable[..., Mesostructure]] = {
     "pictures": _from_pictures,
     "scan": _from_scan,
     "mesh": _from_mesh,
+    "textile": textile.from_tg3,
 }
 """What `meso.type` may be: the generators, and the readers of files."""
+
+SUFFIXES = {".tg3": "textile", ".tmd": "scan", ".obj": "mesh", ".ply": "mesh", ".stl": "mesh", ".off": "mesh"}
+"""The reader of a file that is named alone."""
