@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 from torch import Tensor
 
 from torchmeso.backends import opencl
@@ -365,7 +365,7 @@ class _OnDevice(NamedTuple):
     world: World
     geometry: device.DeviceGeometry
     materials: device_tables.DeviceMaterials
-    corners: Float[np.ndarray, "3 V"]  # see `shadow_map.cameras`
+    corners: shadow_map.Corners
     object_of: list[int]  # of each surface
 
     @property

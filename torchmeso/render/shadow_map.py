@@ -11,6 +11,9 @@ closed surfaces need no bias against self-shadowing at all, however steep or coa
 paper takes for them too, cuts off joints where the slab is thick against the curvature. A texel keeps its triangle:
 depth is taken where the receiver's own light ray meets that plane, not at the texel's centre.
 
+A map of the sun covers what can stop its light: a component that lies in one plane shadows nothing of itself, so a
+wide floor counts as far as something else reaches over it. All texels go to the shadows that there are.
+
 Test: tests/render/test_shadow_map.py
 """
 
@@ -19,7 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchmeso.data.mdf import MIN_COS
@@ -57,8 +60,34 @@ class ShadowFace(NamedTuple):
     triangles: Triangles
 
 
+class Corners(NamedTuple):
+    """The vertices of a scene, as far as a shadow map has to know them; float64.
+
+    Attributes:
+        bodies: (3, V) of all components that can shadow themselves.
+        flats: (3, n) of each component that lies in a plane.
+    """
+
+    bodies: Float[np.ndarray, "3 V"]
+    flats: "tuple[np.ndarray, ...]"
+
+    @property
+    def sets(self) -> list[np.ndarray]:
+        """Return all that are not empty, bodies first."""
+        return [x for x in (self.bodies, *self.flats) if x.size]
+
+
 SLOPE_BIAS, STEEPEST = 2.0, 0.03
 """Bias in texels per texel of depth that a surface falls by across one; cosines are taken no smaller than this."""
+
+FLAT = 1e-5
+"""A component is flat where no vertex lies further from its plane, in units of its size."""
+
+MOST_FLATS = 16
+"""Flat components, the largest, that are looked at one by one; others count as bodies."""
+
+FINEST = 64
+"""A map is fitted to no less than this part of the scene: a texel stays well above what float32 resolves of it."""
 
 
 def build(scene: Scene, world: World, light: Light, *, size: int, silhouette: Silhouette) -> ShadowMap:
@@ -129,28 +158,33 @@ def sizes(light: Light, size: int) -> list[int]:
     return [max(size // 2, 1)] * 6
 
 
-def cameras(corners: Float[np.ndarray, "3 V"], light: Light, size: int) -> list[Camera]:
-    """Return the views from a light: one around all of the scene, one along a cone, or six faces of a cube.
+def cameras(corners: Corners, light: Light, size: int) -> list[Camera]:
+    """Return the views from a light: one around all that casts shadows, one along a cone, or six faces of a cube.
 
     In numpy, whose calls are short: a light may move in every frame.
 
     Args:
-        corners: (3, V) float64 vertices of the scene.
+        corners: of the scene.
         light: any.
         size: side of the map in texels; of a face of a cube, half of it.
     """
     if isinstance(light, DirectionalLight):
         axes = _axes(light.direction)
-        local = axes.numpy() @ corners
-        low, high = local.min(1), local.max(1)
-        extent = float((high - low).max()) * (1 + 4 / size) + 1e-9
-        eye = torch.from_numpy(((low + high) / 2) @ axes.numpy()) + axes[2] * extent
+        low, high, cast_low, cast_high = _extent(corners, axes.numpy())
+        extent = max(float((cast_high - cast_low)[:2].max()), float((high - low).max()) / FINEST)
+        extent = extent * (1 + 4 / size) + 1e-9
+        # Nothing is nearer to the light than the scene's nearest vertex, wherever the map looks.
+        near = 1e-3 * float((high - low).max()) + 1e-9
+        middle = (cast_low + cast_high) / 2
+        middle[2] = high[2] + 2 * near
+        eye = torch.from_numpy(middle @ axes.numpy())
         return [
             Camera(eye=eye, axes=axes, projection="orthographic", view_height=extent, width=size, height=size,
-                   near=extent * 1e-3)
+                   near=near)
         ]  # fmt: skip
     eye = light.position.double()
-    near = max(1e-4 * float(np.linalg.norm(corners - eye.numpy()[:, None], axis=0).max()), 1e-9)
+    far = max(float(np.linalg.norm(x - eye.numpy()[:, None], axis=0).max()) for x in corners.sets)
+    near = max(1e-4 * far, 1e-9)
     if isinstance(light, SpotLight):
         axes = _axes(-light.axis)
         # A texel more on every side, so that the rim of the cone is covered.
@@ -167,9 +201,50 @@ def cameras(corners: Float[np.ndarray, "3 V"], light: Light, size: int) -> list[
     return cube
 
 
-def corners_of(world: World) -> Float[np.ndarray, "3 V"]:
+def corners_of(world: World) -> Corners:
     """Return the vertices as `cameras` takes them."""
-    return np.ascontiguousarray(world.vertices.double().numpy().T)
+    vertices, component = world.vertices.double(), world.component
+    flat = _flat(vertices, world)
+    used = torch.zeros(len(vertices), dtype=torch.bool)
+    used[world.faces[~torch.isin(component, flat)].reshape(-1)] = True
+    flats = [vertices[world.faces[component == c].unique()] for c in flat]
+    bodies, *others = (np.ascontiguousarray(x.numpy().T) for x in (vertices[used], *flats))
+    return Corners(bodies, tuple(others))
+
+
+def _flat(vertices: Float[Tensor, "V 3"], world: World) -> Int[Tensor, "n"]:
+    """Return the open components that lie in a plane, the largest where there are many."""
+    component, count = world.component, len(world.closed)
+    corner = vertices[world.faces]
+    area = torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    normal = normalize(torch.zeros(count, 3, dtype=area.dtype).index_add_(0, component, area))
+    mean = torch.zeros(count, 3, dtype=area.dtype).index_add_(0, component, corner.mean(1))
+    mean /= torch.bincount(component, minlength=count).clamp(min=1).unsqueeze(-1)
+    way = corner - mean[component, None]
+    off = dot(way, normal[component, None]).abs().amax(1)
+    size = torch.zeros(count, dtype=area.dtype).index_reduce_(0, component, way.norm(dim=-1).amax(1), "amax")
+    off = torch.zeros(count, dtype=area.dtype).index_reduce_(0, component, off, "amax")
+    flat = ((off <= FLAT * size) & ~world.closed & (size > 0)).nonzero()[:, 0]
+    return flat[torch.argsort(size[flat], descending=True, stable=True)[:MOST_FLATS]]
+
+
+def _extent(corners: Corners, axes: Float[np.ndarray, "3 3"]) -> tuple[np.ndarray, ...]:
+    """Return the box of a scene along `axes`, low and high, and the part of it in which something can be shadowed."""
+    boxes = [((axes @ x).min(1), (axes @ x).max(1)) for x in corners.sets]
+    lows, highs = np.array([box[0] for box in boxes]), np.array([box[1] for box in boxes])
+    low, high = lows.min(0), highs.max(0)
+    parts = [boxes[0]] if corners.bodies.size else []
+    for k in range(len(parts), len(boxes)):
+        if len(boxes) == 1:
+            break
+        # Shadows that a flat component casts or takes lie where others are in front of it or behind.
+        begin = np.maximum(lows[k], np.delete(lows, k, 0).min(0))
+        end = np.minimum(highs[k], np.delete(highs, k, 0).max(0))
+        if (begin <= end)[:2].all():
+            parts.append((begin, end))
+    if not parts:
+        return low, high, low, low
+    return low, high, np.min([p[0] for p in parts], 0), np.max([p[1] for p in parts], 0)
 
 
 def _axes(back: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
