@@ -25,6 +25,7 @@ from torchmeso.errors import BackendError, check_memory
 from torchmeso.geometry.camera import Camera
 from torchmeso.geometry.light import DirectionalLight, Light, SpotLight
 from torchmeso.render import device, device_tables, film, shadow_map
+from torchmeso.render.casters import Corners, corners_of
 from torchmeso.render.device_raster import ROOM, STAMPS, DeviceViews
 from torchmeso.render.film import Picture
 from torchmeso.render.frame import MEMORY_LIMIT, FrameOptions
@@ -365,7 +366,7 @@ class _OnDevice(NamedTuple):
     world: World
     geometry: device.DeviceGeometry
     materials: device_tables.DeviceMaterials
-    corners: shadow_map.Corners
+    corners: Corners
     object_of: list[int]  # of each surface
 
     @property
@@ -392,7 +393,7 @@ def _upload(scene: Scene, options: FrameOptions, before: _OnDevice | None = None
     if before is not None and same:
         return before._replace(scene=scene, materials=materials)
     world = assemble(scene)
-    corners = shadow_map.corners_of(world)
+    corners = corners_of(world)
     return _OnDevice(scene, world, device.upload_geometry(world), materials, corners, object_of)
 
 

@@ -11,8 +11,7 @@ closed surfaces need no bias against self-shadowing at all, however steep or coa
 paper takes for them too, cuts off joints where the slab is thick against the curvature. A texel keeps its triangle:
 depth is taken where the receiver's own light ray meets that plane, not at the texel's centre.
 
-A map of the sun covers what can stop its light: a component that lies in one plane shadows nothing of itself, so a
-wide floor counts as far as something else reaches over it. All texels go to the shadows that there are.
+A map of the sun covers what can be shadowed (`casters`).
 
 Test: tests/render/test_shadow_map.py
 """
@@ -22,13 +21,14 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchmeso.data.mdf import MIN_COS
 from torchmeso.geometry.camera import Camera
 from torchmeso.geometry.directions import dot, normalize
 from torchmeso.geometry.light import DirectionalLight, Light, SpotLight
+from torchmeso.render.casters import Corners, corners_of, extents
 from torchmeso.render.rasterize import Triangles, depth_at, rasterize
 from torchmeso.render.scene import Scene, World, interpolate, rays
 from torchmeso.render.silhouette import Candidates, Silhouette, find_candidates, nearest
@@ -60,31 +60,8 @@ class ShadowFace(NamedTuple):
     triangles: Triangles
 
 
-class Corners(NamedTuple):
-    """The vertices of a scene, as far as a shadow map has to know them; float64.
-
-    Attributes:
-        bodies: (3, V) of all components that can shadow themselves.
-        flats: (3, n) of each component that lies in a plane.
-    """
-
-    bodies: Float[np.ndarray, "3 V"]
-    flats: "tuple[np.ndarray, ...]"
-
-    @property
-    def sets(self) -> list[np.ndarray]:
-        """Return all that are not empty, bodies first."""
-        return [x for x in (self.bodies, *self.flats) if x.size]
-
-
 SLOPE_BIAS, STEEPEST = 2.0, 0.03
 """Bias in texels per texel of depth that a surface falls by across one; cosines are taken no smaller than this."""
-
-FLAT = 1e-5
-"""A component is flat where no vertex lies further from its plane, in units of its size."""
-
-MOST_FLATS = 16
-"""Flat components, the largest, that are looked at one by one; others count as bodies."""
 
 FINEST = 64
 """A map is fitted to no less than this part of the scene: a texel stays well above what float32 resolves of it."""
@@ -170,13 +147,13 @@ def cameras(corners: Corners, light: Light, size: int) -> list[Camera]:
     """
     if isinstance(light, DirectionalLight):
         axes = _axes(light.direction)
-        low, high, cast_low, cast_high = _extent(corners, axes.numpy())
-        extent = max(float((cast_high - cast_low)[:2].max()), float((high - low).max()) / FINEST)
-        extent = extent * (1 + 4 / size) + 1e-9
-        # Nothing is nearer to the light than the scene's nearest vertex, wherever the map looks.
-        near = 1e-3 * float((high - low).max()) + 1e-9
-        middle = (cast_low + cast_high) / 2
-        middle[2] = high[2] + 2 * near
+        whole, cast = extents(corners, axes.numpy())
+        reach = float((whole.high - whole.low).max())
+        extent = max(float((cast.high - cast.low)[:2].max()), reach / FINEST) * (1 + 4 / size) + 1e-9
+        # Nothing is nearer to the light than the nearest of all vertices, wherever the map looks.
+        near = 1e-3 * reach + 1e-9
+        middle = (cast.low + cast.high) / 2
+        middle[2] = whole.high[2] + 2 * near
         eye = torch.from_numpy(middle @ axes.numpy())
         return [
             Camera(eye=eye, axes=axes, projection="orthographic", view_height=extent, width=size, height=size,
@@ -199,52 +176,6 @@ def cameras(corners: Corners, light: Light, size: int) -> list[Camera]:
             back[axis] = sign
             cube.append(Camera(eye=eye, axes=_axes(back), fov_deg=fov, width=side, height=side, near=near))
     return cube
-
-
-def corners_of(world: World) -> Corners:
-    """Return the vertices as `cameras` takes them."""
-    vertices, component = world.vertices.double(), world.component
-    flat = _flat(vertices, world)
-    used = torch.zeros(len(vertices), dtype=torch.bool)
-    used[world.faces[~torch.isin(component, flat)].reshape(-1)] = True
-    flats = [vertices[world.faces[component == c].unique()] for c in flat]
-    bodies, *others = (np.ascontiguousarray(x.numpy().T) for x in (vertices[used], *flats))
-    return Corners(bodies, tuple(others))
-
-
-def _flat(vertices: Float[Tensor, "V 3"], world: World) -> Int[Tensor, "n"]:
-    """Return the open components that lie in a plane, the largest where there are many."""
-    component, count = world.component, len(world.closed)
-    corner = vertices[world.faces]
-    area = torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    normal = normalize(torch.zeros(count, 3, dtype=area.dtype).index_add_(0, component, area))
-    mean = torch.zeros(count, 3, dtype=area.dtype).index_add_(0, component, corner.mean(1))
-    mean /= torch.bincount(component, minlength=count).clamp(min=1).unsqueeze(-1)
-    way = corner - mean[component, None]
-    off = dot(way, normal[component, None]).abs().amax(1)
-    size = torch.zeros(count, dtype=area.dtype).index_reduce_(0, component, way.norm(dim=-1).amax(1), "amax")
-    off = torch.zeros(count, dtype=area.dtype).index_reduce_(0, component, off, "amax")
-    flat = ((off <= FLAT * size) & ~world.closed & (size > 0)).nonzero()[:, 0]
-    return flat[torch.argsort(size[flat], descending=True, stable=True)[:MOST_FLATS]]
-
-
-def _extent(corners: Corners, axes: Float[np.ndarray, "3 3"]) -> tuple[np.ndarray, ...]:
-    """Return the box of a scene along `axes`, low and high, and the part of it in which something can be shadowed."""
-    boxes = [((axes @ x).min(1), (axes @ x).max(1)) for x in corners.sets]
-    lows, highs = np.array([box[0] for box in boxes]), np.array([box[1] for box in boxes])
-    low, high = lows.min(0), highs.max(0)
-    parts = [boxes[0]] if corners.bodies.size else []
-    for k in range(len(parts), len(boxes)):
-        if len(boxes) == 1:
-            break
-        # Shadows that a flat component casts or takes lie where others are in front of it or behind.
-        begin = np.maximum(lows[k], np.delete(lows, k, 0).min(0))
-        end = np.minimum(highs[k], np.delete(highs, k, 0).max(0))
-        if (begin <= end)[:2].all():
-            parts.append((begin, end))
-    if not parts:
-        return low, high, low, low
-    return low, high, np.min([p[0] for p in parts], 0), np.max([p[1] for p in parts], 0)
 
 
 def _axes(back: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
