@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 from torch import Tensor
 
 from torchmeso.backends import opencl
@@ -25,6 +25,7 @@ from torchmeso.errors import BackendError, check_memory
 from torchmeso.geometry.camera import Camera
 from torchmeso.geometry.light import DirectionalLight, Light, SpotLight
 from torchmeso.render import device, device_gdm, device_shell, device_tables, film, shadow_map
+from torchmeso.render.casters import Corners, corners_of
 from torchmeso.render.device_raster import ROOM, STAMPS, DeviceViews
 from torchmeso.render.film import Picture
 from torchmeso.render.frame import MEMORY_LIMIT, FrameOptions
@@ -366,7 +367,7 @@ class _OnDevice(NamedTuple):
     world: World
     geometry: device.DeviceGeometry
     materials: device_tables.DeviceMaterials
-    corners: Float[np.ndarray, "3 V"]  # see `shadow_map.cameras`
+    corners: Corners
     object_of: list[int]  # of each surface
     shells: device_shell.DeviceShells | None
     gdms: device_gdm.DeviceGdms | None
@@ -403,7 +404,7 @@ def _upload(scene: Scene, options: FrameOptions, before: _OnDevice | None = None
     if before is not None and same:
         return before._replace(scene=scene, materials=materials, gdms=gdms)
     world = assemble(scene)
-    corners = shadow_map.corners_of(world)
+    corners = corners_of(world)
     shells = None
     if world.shells:
         shells = device_shell.upload_shells([(s.shell, s.mesh, s.first_vertex) for s in world.shells])
