@@ -182,7 +182,11 @@ def _bake_one(meso: str, out: Any, force: bool, options: dict[str, Any]) -> None
 @click.option("--terms", type=int, help="hsh: 4, 9 or 16 [9].")
 @click.option("--per-channel", is_flag=True, help="ptm: a polynomial for each channel instead of one and a colour.")
 @click.option(
-    "--storage", default="uint8", show_default=True, type=click.Choice(["uint8", "float16", "float32"]), help="Of maps."
+    "--storage",
+    default="uint8",
+    show_default=True,
+    type=click.Choice(["uint8", "float16", "float32", "adaptive"]),
+    help="Of maps; adaptive (eigen, double-sh): bytes with steps that follow their variance, entropy-coded.",
 )
 @click.option("--mdf", "silhouette", help="MDF table (.mdf.zarr) to pack into the model.")
 @click.option("--allow-missing", is_flag=True, help="Interpolate pictures that a folder or zip lacks.")

@@ -30,7 +30,8 @@ from torchmeso.algebra import secular
 from torchmeso.algebra.secular import Factors
 from torchmeso.algebra.spherical_harmonics import basis, degree_of
 from torchmeso.backends import BackendChoice, opencl
-from torchmeso.compress.quantize import Storage, quantize
+from torchmeso.compress import quantize
+from torchmeso.compress.quantize import Storage
 from torchmeso.data import bands, image
 from torchmeso.data.btf import Bands
 from torchmeso.data.sh_btf import ShBtf
@@ -49,6 +50,9 @@ LANES, GROUPS = 16, 4
 LIT_SHARE = 0.9
 """Share of columns up to which those that are not black are copied out first."""
 
+ROWS = 4
+"""Rows of texels that are read again to tell what the harmonics leave out."""
+
 Progress = Callable[[float], None]
 
 
@@ -60,7 +64,7 @@ class DoubleShOptions:
         light_terms: k_l: 1, 4, 9, 16, 25 or 36.
         view_terms: k_v.
         energy: bound of the coefficients' energy, of the energy that the samples show; None = plain least squares.
-        storage: uint8, float16 or float32.
+        storage: uint8, float16, float32, or adaptive (bytes with steps that follow their variance).
         regularise: let directions that cannot tell the coefficients apart pass, with the smallest coefficients.
     """
 
@@ -146,7 +150,12 @@ def fit(
     for rows, c in coefficients(btf, light, view, bands.layout(btf), backend=backend):
         found[:, rows] = c
         progress(0.9 * rows.stop / height)
-    maps, scale, offset = quantised(found.unflatten(2, (width, 3)), options.storage)
+    maps = found.unflatten(2, (width, 3))
+    step = None
+    if options.storage == "adaptive":
+        lost = left_out(btf, light, view, lambda row: maps[:, row].flatten(1))
+        step = quantize.steps([quantize.spread(c) for c in maps], gain(light, view), lost)
+    maps, scale, offset = quantised(maps, options.storage, step)
     progress(1.0)
     terms = light.terms, view.terms
     return ShBtf(
@@ -309,8 +318,36 @@ def _in_half(c: Float[Tensor, "k column"], where: str) -> Float[Tensor, "k colum
     return half
 
 
-def quantised(found: Float[Tensor, "k H W 3"], storage: Storage) -> tuple[Tensor, Tensor, Tensor]:
+def quantised(
+    found: Float[Tensor, "k H W 3"], storage: Storage, step: Float[Tensor, "k 3"] | None = None
+) -> tuple[Tensor, Tensor, Tensor]:
     """Return codes, scale and offset of every coefficient and channel."""
-    parts = [quantize(c.float()[..., None, :], storage) for c in found]
+    parts = [
+        quantize.quantize(c.float()[..., None, :], storage, None if step is None else step[k, None])
+        for k, c in enumerate(found)
+    ]
     codes, scale, offset = (torch.stack(x).squeeze(-2) for x in zip(*parts, strict=True))
     return codes, scale, offset
+
+
+def gain(light: Side, view: Side) -> Float[Tensor, "k"]:
+    """Return the mean squared T of coefficients of 1, (0,0), (0,1), ..., over all pairs of directions."""
+    over_light, over_view = (side.factors.matrix.square().mean(0) for side in (light, view))
+    return (over_light[:, None] * over_view).flatten()
+
+
+def left_out(btf: Bands, light: Side, view: Side, coefficients: Callable[[int], Float[Tensor, "k column"]]) -> float:
+    """Return the mean squared error of T, before quantisation, in `ROWS` rows of texels spread over the texture.
+
+    `coefficients` is called with a row.
+    """
+    height = btf.texels[0]
+    rows = sorted({(2 * n + 1) * height // (2 * ROWS) for n in range(ROWS)})
+    Y_light, Y_view = (side.factors.matrix.float() for side in (light, view))
+    total = 0.0
+    for row in rows:
+        T = btf.rows(row, row + 1)
+        c = coefficients(row).float().unflatten(0, (light.terms, view.terms))
+        shown = torch.einsum("li,vj,ijx->lvx", Y_light, Y_view, c)
+        total += float((shown - T.flatten(2)).square().mean(dtype=torch.float64))
+    return total / len(rows)
