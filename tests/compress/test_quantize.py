@@ -5,10 +5,10 @@ import torch
 
 from torchmeso.algebra.spherical_harmonics import basis, degree_of
 from torchmeso.compress import double_sh, eigen
+from torchmeso.compress.budget import psnr_of
 from torchmeso.compress.double_sh import DoubleShOptions
 from torchmeso.compress.eigen import EigenOptions
 from torchmeso.compress.quantize import quantize, spread, steps
-from torchmeso.compress.transform import psnr_of
 from torchmeso.data import eigen_btf, sh_btf
 from torchmeso.meso import bake_btf, generators
 from torchmeso.meso.bake_btf import BtfOptions

@@ -1,7 +1,7 @@
 """Error over size at 10:1, 50:1 and 200:1 of eight-bit pictures, on baked materials, for every representation.
 
 Sizes are those of the files: eight bits of double SH and eigen maps, halves of the factors of one decomposition per
-channel (what Bonn's `.btf` files hold), streams and bases of the transform code. PSNR is that of all values, linear,
+channel (what Bonn's `.btf` files hold), streams and bases of the transform code and of adaptive steps. PSNR is that of all values, linear,
 the 99.5th percentile as peak; FLIP the mean of pictures spread over lights and views.
 
 Test: tests/bench/test_rate.py
@@ -22,7 +22,8 @@ from torchmeso.algebra.spherical_harmonics import basis, degree_of
 from torchmeso.bench import frames
 from torchmeso.bench.suite import Context, Row
 from torchmeso.bench.timing import time_together
-from torchmeso.compress import dfmf, double_sh, eigen, transform
+from torchmeso.compress import budget, dfmf, double_sh, double_sh_budget, eigen, eigen_budget, transform
+from torchmeso.compress.budget import Budget
 from torchmeso.compress.dfmf import DfmfOptions
 from torchmeso.compress.double_sh import DoubleShOptions
 from torchmeso.compress.eigen import EigenOptions
@@ -54,7 +55,7 @@ def _at_all_sizes(name: str, table: Btf, T: Tensor) -> Iterator[Row]:
         room = T.numel() // ratio
         found: dict[str, float] = {}
         for method, shown, size in _models(table, T, room, ratio):
-            found[method] = transform.psnr_of(T, shown)
+            found[method] = budget.psnr_of(T, shown)
             goal, why = None, ""
             if method == "transform" and ratio == 10:
                 goal, why = found["double-sh"] + 3, "; goal: double SH + 3 dB"
@@ -86,7 +87,7 @@ def _models(
         tries.append(_shown_harmonics(model))
     yield (
         "double-sh",
-        max(tries, key=lambda shown: transform.psnr_of(T, shown)),
+        max(tries, key=lambda shown: budget.psnr_of(T, shown)),
         light_terms * view_terms * height * width * 3,
     )
     rank = max(1, min(n_view, room // (n_light * height * width * 3)))
@@ -100,6 +101,11 @@ def _models(
         x = torch.stack([U @ V.mT for U, V in factors], -1).unflatten(1, (height, width)).flip(1)
         shown = btfdbb_colour.to_rgb(colour, x).unflatten(0, (n_view, n_light)).transpose(0, 1)
         yield method, shown.float(), rank * per_component
+    coded, _ = eigen_budget.fit(table, Budget(size=room), storage="adaptive")
+    yield "eigen-adaptive", _shown_eigen(coded), eigen_budget.file_size(coded)
+    most = DoubleShOptions(light_terms=36, view_terms=36, energy=10.0, storage="adaptive")
+    harmonic, _ = double_sh_budget.fit(table, Budget(size=room), most, backend="auto")
+    yield "double-sh-adaptive", _shown_harmonics(harmonic), double_sh_budget.file_size(harmonic, coded=True)
     packed, _ = transform.fit(table, TransformOptions(size=room))
     yield "transform", _shown_eigen(packed.expanded()), transform.size(packed)
 
@@ -143,7 +149,7 @@ def _written(table: Btf, T: Tensor, options: EigenOptions | DoubleShOptions, *, 
         else:
             sh_btf.save(double_sh.fit(table, options, backend="auto"), path, coded=coded)
             shown = _shown_harmonics(sh_btf.load(path))
-        return path.stat().st_size, transform.psnr_of(T, shown)
+        return path.stat().st_size, budget.psnr_of(T, shown)
 
 
 def _shown_eigen(model: EigenBtf) -> Float[Tensor, "light view H W 3"]:

@@ -145,18 +145,43 @@ def fit(
     """
     options = options or DoubleShOptions()
     light, view = sides(btf, options)
+    found = whole(btf, light, view, backend=backend, progress=lambda share: progress(0.9 * share))
+    model = model_of(btf, light, view, found, options.storage)
+    progress(1.0)
+    return model
+
+
+def whole(
+    btf: Bands,
+    light: Side,
+    view: Side,
+    *,
+    backend: BackendChoice = "torch",
+    progress: Progress = lambda share: None,
+) -> Float[Tensor, "k H W 3"]:
+    """Return the coefficients of the whole texture, k = (0,0), (0,1), ..., in float16; raises as `coefficients`."""
     height, width = btf.texels
     found = torch.empty(light.terms * view.terms, height, width * 3, dtype=torch.float16)
     for rows, c in coefficients(btf, light, view, bands.layout(btf), backend=backend):
         found[:, rows] = c
-        progress(0.9 * rows.stop / height)
-    maps = found.unflatten(2, (width, 3))
+        progress(rows.stop / height)
+    return found.unflatten(2, (width, 3))
+
+
+def model_of(
+    btf: Bands,
+    light: Side,
+    view: Side,
+    found: Float[Tensor, "k H W 3"],
+    storage: Storage,
+    share: float = quantize.SHARE,
+) -> ShBtf:
+    """Return the model of coefficients; of adaptive steps `share` is what they may add to the squared error."""
     step = None
-    if options.storage == "adaptive":
-        lost = left_out(btf, light, view, lambda row: maps[:, row].flatten(1))
-        step = quantize.steps([quantize.spread(c) for c in maps], gain(light, view), lost)
-    maps, scale, offset = quantised(maps, options.storage, step)
-    progress(1.0)
+    if storage == "adaptive":
+        lost = left_out(btf, light, view, lambda row: found[:, row].flatten(1))
+        step = quantize.steps([quantize.spread(c) for c in found], gain(light, view), lost, share)
+    maps, scale, offset = quantised(found, storage, step)
     terms = light.terms, view.terms
     return ShBtf(
         maps=maps.unflatten(0, terms), scale=scale.unflatten(0, terms), offset=offset.unflatten(0, terms),

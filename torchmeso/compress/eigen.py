@@ -52,18 +52,9 @@ def fit(btf: Bands, options: EigenOptions | None = None, *, progress: Progress =
     """
     options = options or EigenOptions()
     check(btf, options)
-    n_view = len(btf.views)
-    height, width = btf.texels
-    layout = bands.layout(btf)
-    total = torch.zeros(n_view, n_view, dtype=torch.float64)
-    for rows, sum_so_far in grams(btf, layout, total):
-        total = sum_so_far
-        progress(0.5 * rows.stop / height)
+    total = gram_over_views(btf, lambda share: progress(0.5 * share))
     W = right_basis(total, options.rank).vectors.float()
-    maps = torch.empty(len(btf.lights), height, width, options.rank, 3)
-    for rows, E in scores(btf, W, layout):
-        maps[:, rows] = E.permute(1, 2, 3, 0, 4)
-        progress(0.5 + 0.5 * rows.stop / height)
+    maps = maps_of(btf, W, lambda share: progress(0.5 + 0.5 * share))
     step = None
     if options.storage == "adaptive":
         spreads = (quantize.spread(maps[..., k, :]) for k in range(options.rank))
@@ -72,6 +63,28 @@ def fit(btf: Bands, options: EigenOptions | None = None, *, progress: Progress =
     return EigenBtf(
         maps=codes.codes, weights=W, scale=codes.scale, offset=codes.offset, lights=btf.lights, views=btf.views
     )
+
+
+def gram_over_views(btf: Bands, progress: Progress = lambda share: None) -> Float[Tensor, "view view"]:
+    """Return the sum over all rows of the matrix, in float64."""
+    n_view = len(btf.views)
+    total = torch.zeros(n_view, n_view, dtype=torch.float64)
+    for rows, sum_so_far in grams(btf, bands.layout(btf), total):
+        total = sum_so_far
+        progress(rows.stop / btf.texels[0])
+    return total
+
+
+def maps_of(
+    btf: Bands, W: Float[Tensor, "view rank"], progress: Progress = lambda share: None
+) -> Float[Tensor, "light H W rank 3"]:
+    """Return the eigen maps E = A W of the whole texture."""
+    height, width = btf.texels
+    maps = torch.empty(len(btf.lights), height, width, W.shape[1], 3)
+    for rows, E in scores(btf, W, bands.layout(btf)):
+        maps[:, rows] = E.permute(1, 2, 3, 0, 4)
+        progress(rows.stop / height)
+    return maps
 
 
 def adaptive_steps(

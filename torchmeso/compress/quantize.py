@@ -71,33 +71,49 @@ def spread(values: Float[Tensor, "*batch channel"]) -> Spread:
     return Spread(flat.amin(0), flat.amax(0), sample - sample.mean(0))
 
 
-def steps(spreads: Sequence[Spread], gain: Float[Tensor, "rank"], lost: float) -> Float[Tensor, "rank channel"]:
+def steps(
+    spreads: Sequence[Spread], gain: Float[Tensor, "rank"], lost: float, share: float = SHARE
+) -> Float[Tensor, "rank channel"]:
     """Return the adaptive steps of all components.
 
     Args:
         spreads: of each component.
         gain: mean squared error of T for a mean squared error of 1 of a component, over all that T is a table of.
         lost: mean squared error of T that the model has before it is quantised.
+        share: of `lost`, what may be added to it.
     """
-    low, high, sample = (torch.stack(x) for x in zip(*spreads, strict=True))
-    range_, share = (high - low).double(), gain.double()
-    eight_bits = float((share[:, None] * (range_ / 255).square()).mean(1).sum()) / 12
-    spare = eight_bits + SHARE * (lost + eight_bits)
-
-    def of(d: float) -> Tensor:
-        # A byte holds 256 codes, and the mean lies on one of them.
-        return torch.maximum(d / share.sqrt()[:, None], range_ / 254).clamp(min=torch.finfo(torch.float32).tiny)
+    sample, range_ = torch.stack([s.sample for s in spreads]), _ranges(spreads)
+    eight_bits = float((gain.double()[:, None] * (range_ / 255).square()).mean(1).sum()) / 12
+    spare = eight_bits + share * (lost + eight_bits)
 
     def error(d: float) -> float:
-        step = of(d).float()[:, None]
+        step = equal_steps(spreads, gain, d)[:, None]
         found = (sample - (sample / step).round_() * step).square_().mean((1, 2), dtype=torch.float64)
-        return float((share * found).sum())
+        return float((gain.double() * found).sum())
 
-    fine, coarse = -60.0, math.log(max(float((range_ * share.sqrt()[:, None]).amax()), 1e-20)) + 1
+    fine, coarse = -60.0, math.log(coarsest(spreads, gain))
     for _ in range(32):
         middle = (fine + coarse) / 2
         fine, coarse = (middle, coarse) if error(math.exp(middle)) <= spare else (fine, middle)
-    return of(math.exp(fine)).float()
+    return equal_steps(spreads, gain, math.exp(fine))
+
+
+def equal_steps(spreads: Sequence[Spread], gain: Float[Tensor, "rank"], d: float) -> Float[Tensor, "rank channel"]:
+    """Return the steps with which all components have the same error of T, d / sqrt(gain).
+
+    Where a byte has not as many codes (256, and the mean lies on one of them), a component has larger ones.
+    """
+    step = torch.maximum(d / gain.double().sqrt()[:, None], _ranges(spreads) / 254)
+    return step.float().clamp(min=torch.finfo(torch.float32).tiny)
+
+
+def coarsest(spreads: Sequence[Spread], gain: Float[Tensor, "rank"]) -> float:
+    """Return a d from which on all codes are 0."""
+    return max(3 * float((_ranges(spreads) * gain.double().sqrt()[:, None]).amax()), 1e-20)
+
+
+def _ranges(spreads: Sequence[Spread]) -> Float[Tensor, "rank channel"]:
+    return torch.stack([s.high - s.low for s in spreads]).double()
 
 
 def quantize(
