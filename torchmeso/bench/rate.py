@@ -1,8 +1,8 @@
 """Error over size at 10:1, 50:1 and 200:1 of eight-bit pictures, on baked materials, for every representation.
 
 Sizes are those of the files: eight bits of double SH and eigen maps, halves of the factors of one decomposition per
-channel (what Bonn's `.btf` files hold), streams and bases of the transform code and of adaptive steps. PSNR is that of all values, linear,
-the 99.5th percentile as peak; FLIP the mean of pictures spread over lights and views.
+channel (what Bonn's `.btf` files hold), streams and bases of the transform code and of adaptive steps. PSNR is that of
+all values, linear, the 99.5th percentile as peak; FLIP the mean of pictures spread over lights and views.
 
 Test: tests/bench/test_rate.py
 """

@@ -42,6 +42,9 @@ COLUMNS = 512
 MARGIN_DB, MARGIN = 0.2, 1.25
 """By which a few rows may say less, and in bytes more, than is true of the whole texture."""
 
+MOST_TRIES = 6
+"""Fits of the whole texture."""
+
 
 class Candidate(NamedTuple):
     """Coefficients and steps, and what a few rows say of their size and error."""
@@ -79,16 +82,26 @@ def fit(
     peak = budget.peak_of(T)
     table = Btf(images=T, lights=btf.lights, views=btf.views)
     found = list(_candidates(table, peak, options, backend, lambda share: progress(0.7 * share)))
+    kept: list[tuple[float, ShBtf]] = []
     reached, least = max(x.psnr for x in found), min(x.size for x in found)
-    for tried, candidate in enumerate(_hopeful(found, wanted)):
+    tried: list[Candidate] = []
+    while len(tried) < MOST_TRIES and (candidate := _next(found, tried, wanted, bool(kept))) is not None:
         model = _fitted(table, candidate, options, backend)
         error, size = psnr(T, model, peak), file_size(model, coded=options.storage == "adaptive")
-        if wanted.kept(error, size):
-            progress(1.0)
-            return model, error
         # What was measured counts, not what rows said.
-        reached, least = (error, size) if tried == 0 else (max(reached, error), min(least, size))
-        progress(1 - 0.3 / (tried + 2))
+        reached, least = (max(reached, error), min(least, size)) if tried else (error, size)
+        if wanted.kept(error, size):
+            kept.append((error, model))
+            if wanted.psnr is not None or options.storage != "adaptive":
+                break
+        # Streams of a few rows are longer for what they hold: all sizes are corrected by what this one was off.
+        found = [x._replace(size=x.size * size / candidate.size) for x in found]
+        tried = [*tried, candidate]
+        progress(0.7 + 0.3 * len(tried) / MOST_TRIES)
+    progress(1.0)
+    if kept:
+        best, model = max(kept, key=lambda x: x[0])
+        return model, best
     if wanted.psnr is not None:
         raise budget.too_exact(reached, wanted.psnr)
     assert wanted.size is not None
@@ -158,12 +171,20 @@ def _told_apart(what: str, directions: DirectionSet, terms: int, options: Double
     return True
 
 
-def _hopeful(found: list[Candidate], wanted: Budget) -> list[Candidate]:
-    """Return those that may keep the budget, the best first."""
+def _next(found: list[Candidate], tried: list[Candidate], wanted: Budget, kept: bool) -> Candidate | None:
+    """Return the best that was not tried and may keep the budget; once it is `kept`, only one that promises more."""
+    done = [x[:3] for x in tried]
     if wanted.psnr is not None:
-        return sorted((x for x in found if x.psnr > wanted.psnr - MARGIN_DB), key=lambda x: x.size)
+        left = (x for x in found if x.psnr > wanted.psnr - MARGIN_DB and x[:3] not in done)
+        return min(left, key=lambda x: x.size, default=None)
     room = wanted.size or 0
-    return sorted((x for x in found if x.size <= MARGIN * room), key=lambda x: (x.size > room, -x.psnr))
+    fitting = [x for x in found if x.size <= room]
+    left = [x for x in fitting if x[:3] not in done]
+    if left and max(x.psnr for x in left) >= max(x.psnr for x in fitting):
+        return max(left, key=lambda x: x.psnr)
+    if kept:
+        return None
+    return min((x for x in found if x.size <= MARGIN * room and x[:3] not in done), key=lambda x: x.size, default=None)
 
 
 def _fitted(table: Btf, candidate: Candidate, options: DoubleShOptions, backend: BackendChoice) -> ShBtf:
