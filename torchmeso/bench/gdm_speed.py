@@ -1,17 +1,16 @@
-"""Rows of the suite `gdm` on time: frames of shells beside Embree, the paper's rates, both backends; and that no ray
-gets lost.
+"""Rows of the suite `gdm` on time: frames of shells beside Embree, the paper's rates, both backends; lost rays.
 
-Frames are 512 x 512, with one light; those "with shadows" draw their shadow map (768^2) every time. The twin is the same
-weave, laid over the same mesh as triangles. The paper's meshes are not at hand: shapes with its triangle counts stand
-in, and the coverage is that of the picture.
+Frames are 512 x 512, with one light; those "with shadows" draw their shadow map (768^2) every time. The twin is the
+same weave, laid over the same mesh as triangles. The paper's meshes are not at hand: shapes with its triangle counts
+stand in, and the coverage is that of the picture.
 
 Test: tests/bench/test_gdm_speed.py
 """
 
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -40,12 +39,10 @@ from torchmeso.render.frame import FrameOptions, Skips
 from torchmeso.render.gdm_trace import Entries
 from torchmeso.render.rasterize import rasterize
 from torchmeso.render.renderer import Renderer
-from torchmeso.render.scene import Material, Object, Scene
+from torchmeso.render.scene import Material, Object, Scene, ShellOptions
 
 SIZE = 512
-LIGHT = DirectionalLight(
-    direction=normalize(torch.tensor([0.5, 0.8, 0.4])), irradiance=torch.full((3,), torch.pi)
-)
+LIGHT = DirectionalLight(direction=normalize(torch.tensor([0.5, 0.8, 0.4])), irradiance=torch.full((3,), torch.pi))
 EYE = (0.0, 2.04, 2.21)
 """From where a torus fills three quarters of the picture."""
 
@@ -60,7 +57,7 @@ class Row7(NamedTuple):
     arguments: dict
     texels: int
     layers: int
-    base: str
+    base: Literal["solid", "open"]
     fps: float
 
 
@@ -140,7 +137,8 @@ def against_embree(context: Context) -> Iterator[Row]:
             held = device_gdm.table_bytes(gdm) + 32 * gdm.occupancy.numel()
             beside = n * (36 + 12) + n * 64  # vertices and faces as they are; Embree's tree takes no less than this
             yield Row(
-                id=f"embree.{texels}.memory", what=f"mesh and tree of {n} triangles over the direct table as it is read",
+                id=f"embree.{texels}.memory",
+                what=f"mesh and tree of {n} triangles over the direct table as it is read",
                 value=round(beside / held, 2), unit="x", better="higher",
                 peer=f"table {held / 1e6:.1f} MB, twin at least {beside / 1e6:.0f} MB",
             )  # fmt: skip
@@ -155,7 +153,7 @@ def figure_7(context: Context) -> Iterator[Row]:
     try:
         for name, row in rows_7().items():
             gdm = table(row.meso, GdmOptions(texels=row.texels, layers=row.layers), context, **row.arguments)
-            shelled = Material(gdm=gdm, shell=_shell(row.base))
+            shelled = Material(gdm=gdm, shell=ShellOptions(base=row.base))
             renderer = drawn(scene_of(row.mesh, shelled), shadows=True)
             eye = (0.0, 2.6, 3.2) if name == "bird" else EYE
             t = time_together({"ours": partial(renderer.show, view(eye))}, n=9 if context.quick else 25, warm=3)["ours"]
@@ -171,12 +169,6 @@ def figure_7(context: Context) -> Iterator[Row]:
             )  # fmt: skip
     finally:
         torch.set_num_threads(threads)
-
-
-def _shell(base: str):
-    from torchmeso.render.scene import ShellOptions
-
-    return ShellOptions(base="open" if base == "open" else "solid")
 
 
 def backends(context: Context) -> Iterator[Row]:
@@ -213,7 +205,8 @@ def walk(context: Context) -> Iterator[Row]:
         found = DeviceTrace(built, row.mesh, gdm, floor=floor).trace(entries)
         same = (found.prism == truth.prism) & (found.hit == truth.hit) & (found.prisms == truth.prisms)
         yield Row(
-            id=f"walk.{name}.same", what=f"{len(same)} rays, {row.meso}: the same prisms and the same answer as float64",
+            id=f"walk.{name}.same",
+            what=f"{len(same)} rays, {row.meso}: the same prisms and the same answer as float64",
             value=round(100 * float(same.double().mean()), 4), unit="%", better="higher", goal=99.99,
             peer=f"{int((~same).sum())} differ, {int((found.prisms < 0).sum())} lost",
         )  # fmt: skip
@@ -317,6 +310,4 @@ def _camera_entries(mesh: Mesh, h: float, camera: Camera) -> tuple[shell.Shell, 
 
 def _squeezed(mesh: Mesh) -> Mesh:
     """Return a mesh as flat as paper, so that its triangles are needles."""
-    from dataclasses import replace
-
     return replace(mesh, vertices=mesh.vertices * torch.tensor([1.0, 0.02, 1.0]))

@@ -102,9 +102,7 @@ def _only(body: Body, k: int) -> Mesh:
     return replace(body.mesh, faces=body.mesh.faces[mine], component=body.mesh.component[mine])
 
 
-def _geometries(
-    config: Config, mesos: dict[str, Mesostructure], body: Mesh, look: str | Finish
-) -> Iterator[Geometry]:
+def _geometries(config: Config, mesos: dict[str, Mesostructure], body: Mesh, look: str | Finish) -> Iterator[Geometry]:
     """Yield what a body is made of: its surface, displaced, and the floor of a solid shell."""
     material = config.materials[look] if isinstance(look, str) else None
     if material is None or material.gdm is None:
