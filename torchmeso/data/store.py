@@ -2,8 +2,8 @@
 
 Raw tables (.btf.zarr, .mdf.zarr) are Zarr 3 groups filled block by block; a job that was cut off leaves
 `<name>.part` with the blocks it finished, and the same job goes on from there. Zarr reads a missing block as zeros;
-ours are all written, black ones too, and a finished table that lacks one is refused where it is opened. Run-time models (.meso) are
-safetensors files, one tensor per component, memory-mapped: what is not asked for is never read.
+ours are all written, black ones too, and a finished table that lacks one is refused where it is opened. Run-time models
+(.meso) are safetensors files, one tensor per component, memory-mapped: what is not asked for is never read.
 
 Test: tests/data/test_store.py
 """
