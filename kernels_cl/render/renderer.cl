@@ -190,11 +190,14 @@ static void draw_stamp(const Place *place, const Target *target, const Rays *ray
     int blocked[MAX_LIGHTS];
     float16 slack = 0.0f;
 #ifdef GDM
+    Matter matter;
+    const Place3 in_slab = {seen->at.u, seen->at.v, seen->z};
     for (int rest = shaded & seen->met; rest;) {
         int object;
         const int same = of_one_object(&seen->object, rest, &object);
         rest &= ~same;
         slack = from_bits(same) ? place->gdms[object].h * seen->at.scale : slack;
+        material_of(place->gdm_tables, place->gdms + object, &in_slab, seen->floor, same, &matter);
     }
 #endif
     const float16 d = from_bits(shaded) ? seen->depth.vector : (float16)0.0f;
@@ -204,7 +207,9 @@ static void draw_stamp(const Place *place, const Target *target, const Rays *ray
         int asked = place->skips & SKIP_FACING && !(frame->outputs & OWNER)
                   ? facing(lights + i, &seen->at.n, &seen->position, shaded) : shaded;
 #ifdef GDM
-        asked |= shaded & seen->met;  // what stands in a shell has normals of its own
+        if (place->skips & SKIP_FACING && !(frame->outputs & OWNER) && seen->met)  // it has normals of its own
+            asked = (asked & ~seen->met) |
+                    faces_light(lights + i, &seen->at, &seen->position, &matter, shaded & seen->met);
 #endif
         tally->averted += __builtin_popcount(shaded & ~asked);
         const int first = lights[i].first_face, count = lights[i].faces;
@@ -224,7 +229,7 @@ static void draw_stamp(const Place *place, const Target *target, const Rays *ray
         const int met = same & seen->met;
         if (met) {
             shade_shell(place->gdm_tables, place->gdms + object, lights, frame, rays, &seen->at, &seen->position,
-                        seen->z, seen->floor, met, blocked, colour);
+                        seen->z, &matter, met, blocked, colour);
             same = met;
         } else
 #endif
