@@ -32,7 +32,7 @@ static INNER void trace_sixteen(__global const Ray *rays, const Shells *shells, 
     const Vector3 along = {p[3].vector, p[4].vector, p[5].vector};
     Met met;
     const int bits = (1 << count) - 1;
-    const int hit = walk(shells, tables, gdm, &origin, &along, 0.0f, bits, entry.vector, &met);
+    const int hit = walk(shells, tables, gdm, &origin, &along, 0.0f, bits, entry.vector, 0, &met);
     const Floats u = {met.place.u}, v = {met.place.v}, z = {met.place.z};
     const Floats wx = {met.way.x}, wy = {met.way.y}, wz = {met.way.z};
     for (int l = 0; l < count; l++) {

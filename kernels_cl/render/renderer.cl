@@ -251,6 +251,42 @@ static void draw_stamp(const Place *place, const Target *target, const Rays *ray
     }
 }
 
+#ifdef GDM
+// What rays meet first in shells that the eye is inside of; returns whether it is inside of any.
+static int look_from_within(const Place *place, const Rays *rays, __global const Frame *frame, const int lanes,
+                            Seen *seen, Tally *tally)
+{
+    for (int i = 0; i < frame->starts; i++) {
+        const int object = frame->start_surface[i];
+        Met met;
+        const int hit = walk(&place->shells, place->gdm_tables, place->gdms + object, &rays->origin, &rays->direction,
+                             (float16)0.0f, lanes, (int16)(frame->start_tet[i] << 2), frame->start_place[i], &met);
+        tally->prisms += met.prisms;
+        tally->tets += met.steps;
+        tally->endless += __builtin_popcount(met.endless);
+        if (i == 0) {
+            const Vector3 up = {0.0f, 0.0f, 1.0f}, along = {1.0f, 0.0f, 0.0f};
+            seen->at = framed(up, along, (float16)1.0f);
+            seen->position = rays->origin;
+        }
+        const int bits = hit & to_bits(met.t.vector < seen->depth.vector);
+        const int16 better = from_bits(bits);
+        const float16 t = MAX(met.t.vector, (float16)0.0f);
+        surface_in_shell(place->shells.prisms, place->records, &met, bits, &seen->at);
+        seen->seen |= bits;
+        seen->met |= bits;
+        seen->floor = (seen->floor & ~bits) | (bits & met.floor);
+        seen->z = better ? met.place.z : seen->z;
+        seen->depth.vector = better ? t : seen->depth.vector;
+        seen->object.vector = better ? (int16)object : seen->object.vector;
+        seen->position.x = better ? rays->origin.x + t * rays->direction.x : seen->position.x;
+        seen->position.y = better ? rays->origin.y + t * rays->direction.y : seen->position.y;
+        seen->position.z = better ? rays->origin.z + t * rays->direction.z : seen->position.z;
+    }
+    return frame->starts > 0;
+}
+#endif
+
 // What the rays of a stamp end on: the nearest of all stretches that stop them.
 static Seen look(const Place *place, const Rays *rays, __global const float16 *key, __global const int16 *slot,
                  const int filled, const int lanes, const Target *target, Tally *tally)
@@ -266,7 +302,10 @@ static Seen look(const Place *place, const Rays *rays, __global const float16 *k
 #endif
     Ints next;
     next.vector = 0;
-    int active = lanes, first_round = 1, first_seen = 1;
+    int active = filled ? lanes : 0, first_round = 1, first_seen = 1;
+#ifdef GDM
+    first_seen = !look_from_within(place, rays, frame, lanes, &seen, tally);
+#endif
     while (active) {
         Stretches found;
         const int candidates = next_stretches(place, rays, key, slot, filled, &active, &next, &seen.depth, first_round,
@@ -465,29 +504,30 @@ static INNER void draw_tiles(const int worker, __global const View *restrict vie
             const int x = x0 + 4 * (s % STAMPS), y = y0 + 4 * (s / STAMPS);
             if (x >= view->width || y >= view->height) continue;
             const int filled = lists.filled[s], at = (y >> 2) * (frame->pitch >> 2) + (x >> 2);
-            if (!filled && empty[at] && frame->skips & SKIP_EMPTY) {
+            const int nothing = !filled && !frame->starts;
+            if (nothing && empty[at] && frame->skips & SKIP_EMPTY) {
                 skipped++;
                 continue;
             }
-            empty[at] = !filled;
-            if (!filled) {
+            empty[at] = nothing;
+            if (nothing) {
                 clear_stamp(frame, plane, x, y, background, shown_background, shown, rgba, depth, owner, shadowed);
                 continue;
             }
             const Rays rays = stamp_rays(view, x, y);
             const int lanes = to_bits((x + LX < view->width) & (y + LY < view->height));
             __global const float16 *key_of = key + lists.begin[s];
-            tally.covered += __builtin_popcount(lanes & to_bits(key_of[0] < INFINITY));
+            const int near = filled ? lanes & to_bits(key_of[0] < INFINITY) : 0;
+            tally.covered += __builtin_popcount(near);
             tally.deepest = MAX(tally.deepest, filled);
             for (int k = 0; k < filled; k++)
                 tally.fragments += __builtin_popcount(lanes & to_bits(key_of[k] < INFINITY));
 #ifdef SHADOWS
             // What is seen lies near the first fragment: its shadow is asked for before all else.
-            const int near = lanes & to_bits(key_of[0] < INFINITY);
             const float16 first = view->perspective ? -rays.stretch / key_of[0] : key_of[0];
             const Vector3 nearest = {rays.origin.x + first * rays.direction.x, rays.origin.y + first * rays.direction.y,
                                      rays.origin.z + first * rays.direction.z};
-            for (int i = 0; i < frame->lights; i++)
+            for (int i = 0; near && i < frame->lights; i++)
                 if (lights[i].faces == 1) fetch_shadow_ahead(&shadows, lights[i].first_face, &nearest, near);
 #endif
             const Seen seen = look(&place, &rays, key_of, slot + lists.begin[s], filled, lanes, &target, &tally);

@@ -119,6 +119,21 @@ def test_opencl_shows_what_torch_shows(weave, kind):
     assert ((screen - exact.clamp(0, 1)).abs().amax(-1) > 2 / 255).double().mean() < 0.004
 
 
+@pytest.mark.parametrize("base", ["solid", "open"])
+def test_the_eye_may_be_inside_of_a_shell(weave, base):
+    scene = dressed(weave, base)
+    at = torch.tensor([1.0, 0.33, 0.02])  # below the top of the torus, among the yarns
+    ahead = at + torch.tensor([0.02, 0.3, 1.0])
+    eye = camera(tuple(at.tolist()), tuple(ahead.tolist()), size=48, fov_deg=70.0)
+    renderer = Renderer(scene, OPTIONS)
+    shown = renderer.render(eye)
+    truth = frame.render(scene, eye, OPTIONS)
+    assert renderer._picture.frame.array[0]["starts"] > 0
+    assert (truth.owner == 0).double().mean() > 0.2
+    assert (shown.owner == truth.owner).double().mean() > 0.998
+    assert ((shown.rgb - truth.rgb).abs().amax(-1) > 1 / 255).double().mean() < 0.005
+
+
 def test_near_material_casts_shadows_and_far_material_through_the_map(weave):
     """A low light leaves less of a weave lit than a high one, and the torus shadows the ground."""
     high = frame.render(dressed(weave, "solid"), camera((1.5, 2.5, 2.0), size=48), OPTIONS)

@@ -143,7 +143,7 @@ def _develop(
     shadowed = torch.zeros(len(scene.lights), n_pixel, dtype=torch.bool)
     depth[seen.pixel] = seen.depth
 
-    inside = seen.pixel[seen.fragment < 0]
+    inside = seen.pixel[(seen.fragment < 0) & (seen.prism < 0)]
     rgb[inside], owner[inside] = 0, -2
     met = seen.select(seen.prism >= 0)
     plain = seen.select((seen.fragment >= 0) & (seen.prism < 0))

@@ -38,13 +38,15 @@ class Entries(NamedTuple):
         origin: (n, 3) float64.
         direction: (n, 3) unit.
         tet: (n,) tetrahedron behind the face.
-        corner: (n,) its corner opposite the face.
+        corner: (n,) its corner opposite the face; -1: the ray begins inside of the tetrahedron.
+        place: (n, 3) texture coordinates of rays that begin inside; None where none does.
     """
 
     origin: Float[Tensor, "n 3"]
     direction: Float[Tensor, "n 3"]
     tet: Int[Tensor, "n"]
     corner: Int[Tensor, "n"]
+    place: Float[Tensor, "n 3"] | None = None
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -87,9 +89,13 @@ def trace(shell: Shell, gdm: Gdm | None, entries: Entries, *, queries: int = 1, 
     axes = around(entries.direction.double())
     rays = _Rays(entries.origin.double(), torch.stack([axes.t, axes.b, axes.n], 1))
     tet, corner = entries.tet.clone(), entries.corner.clone()
+    within = corner < 0
+    corner[within] = _behind(shell, _Rays(rays.origin[within], rays.axes[within]), tet[within])
     rays, enters = _into_face(shell, rays, tet, corner)
     share = _shares(shell, rays, tet, corner)
     start_t, start = share.t.clone(), share.place.clone()
+    if entries.place is not None:
+        start_t[within], start[within] = 0, entries.place[within].double()
     hit, t = torch.zeros(n, dtype=torch.bool), share.t.clone()
     place, direction = share.place.clone(), torch.zeros(n, 3, dtype=torch.float64)
     prism, through, prisms = tet // 3, torch.zeros(n, dtype=torch.long), torch.ones(n, dtype=torch.long)
@@ -185,6 +191,17 @@ def _into_face(shell: Shell, rays: _Rays, tet: Tensor, corner: Tensor) -> tuple[
         way = p.mean(1) * step
         origin[active] += (way[:, :, None] * rays.axes[active, :2]).sum(1)
     return _Rays(origin, rays.axes), enters
+
+
+def _behind(shell: Shell, rays: _Rays, tet: Tensor) -> Tensor:
+    """Return the corner of `tet` opposite the face by which rays would have come in that begin inside of it."""
+    found = torch.zeros_like(tet)
+    for corner in range(4):
+        vertex = shell.tets[tet][:, INTO[corner]]
+        p = _seen(shell, rays, vertex)[..., :2]
+        inside = left_of(p, p.roll(-1, 1), vertex, vertex.roll(-1, 1)).all(1)
+        found[inside] = corner
+    return found
 
 
 def _shares(shell: Shell, rays: _Rays, tet: Tensor, corner: Tensor) -> _Share:

@@ -9,8 +9,10 @@ changed. The torch frame (`frame.render`) is the formula of all of this.
 Kernels: kernels_cl/render/renderer.cl, kernels_cl/render/shadow_map.cl          Test: tests/render/test_renderer.py
 """
 
+import itertools
 import operator
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -22,6 +24,7 @@ from torch import Tensor
 from torchmeso.backends import opencl
 from torchmeso.data import image
 from torchmeso.errors import BackendError, check_memory
+from torchmeso.geometry import shell
 from torchmeso.geometry.camera import Camera
 from torchmeso.geometry.light import DirectionalLight, Light, SpotLight
 from torchmeso.render import device, device_gdm, device_shell, device_tables, film, shadow_map
@@ -37,10 +40,15 @@ MAX_LIGHTS = 64
 DETAILS, DISPLAY = 1, 2
 """What a frame writes: a `Picture`, or bytes for a screen."""
 
+MOST_STARTS = 4
+"""Tetrahedra of shells that the eye is in; the others of a shell that overlaps itself more often are left out."""
+
 FRAME = np.dtype(
     [(name, "i4") for name in ("lights", "ambient_paper", "depths", "outputs")]
     + [(name, "i4") for name in ("capacity", "skips", "stride", "pitch")]
-    + [("ambient", "f4"), ("background", "f4", 3), ("rank_error", "f4"), ("pixel", "f4"), ("pad", "i4", 2)]
+    + [("ambient", "f4"), ("background", "f4", 3), ("rank_error", "f4"), ("pixel", "f4")]
+    + [("starts", "i4"), ("pad", "i4"), ("start_tet", "i4", MOST_STARTS), ("start_surface", "i4", MOST_STARTS)]
+    + [("start_place", "f4", (MOST_STARTS, 4))]
 )
 
 
@@ -314,6 +322,10 @@ class Renderer:
         frame["pixel"] = camera.pixel_size / self.options.antialias
         frame["pitch"] = picture.rgba.shape[1]
         frame["ambient"], frame["background"] = scene.ambient, scene.background
+        frame["starts"] = 0
+        for k, start in enumerate(itertools.islice(self._on_device.starts(camera), MOST_STARTS)):
+            frame["start_tet"][k], frame["start_surface"][k], frame["start_place"][k, :3] = start
+            frame["starts"] = k + 1
         picture.frame.send()
         if outputs != picture.outputs:
             picture.empty.array[:] = 0
@@ -371,6 +383,12 @@ class _OnDevice(NamedTuple):
     object_of: list[int]  # of each surface
     shells: device_shell.DeviceShells | None
     gdms: device_gdm.DeviceGdms | None
+
+    def starts(self, camera: Camera) -> Iterator[tuple[int, int, list[float]]]:
+        """Yield the tetrahedra that the eye is in, their surfaces, and its texture coordinates there."""
+        for placed in self.world.shells if camera.projection == "perspective" else ():
+            for tet, place in zip(*shell.around(placed.shell, camera.eye), strict=True):
+                yield int(tet) + placed.first_tet, placed.surface, place.tolist()
 
     @property
     def of_shells(self) -> "tuple[opencl.Buffer, ...]":

@@ -22,12 +22,12 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchmeso.data.mdf import MIN_COS
-from torchmeso.geometry import frames
+from torchmeso.geometry import frames, shell
 from torchmeso.geometry.camera import Camera
 from torchmeso.geometry.shell import BOTTOM
 from torchmeso.render import curved_silhouette, gdm_trace
 from torchmeso.render.rasterize import Layers
-from torchmeso.render.scene import Points, Scene, World, interpolate, rays
+from torchmeso.render.scene import PlacedShell, Points, Scene, World, interpolate, rays
 
 Silhouette = Literal["none", "paper", "curved"]
 
@@ -173,6 +173,9 @@ def find_candidates(
     depth = torch.cat([t_front[hit] + d_front[hit], t_single + d_single])
     nowhere = torch.full((len(pixel), 3), torch.nan, dtype=depth.dtype)
     plain = Candidates(pixel, fragment, back, t, depth, torch.full_like(back, -1), nowhere, back < -1)
+    if world.shells and depths:
+        within = _from_within(scene, world, camera, layers.t.dtype)
+        plain = Candidates(*(torch.cat([a, b]) for a, b in zip(plain, within, strict=True)))
     if len(entries):
         met = _meet_gdms(scene, world, camera, layers, entries)
         counts = counts._replace(carved=counts.carved + len(entries) - len(met.pixel))
@@ -191,6 +194,36 @@ def _entries(scene: Scene, world: World, layers: Layers, single: Tensor) -> tupl
     return single[enters & front], single[~dressed | (front & ~enters)]
 
 
+def _from_within(scene: Scene, world: World, camera: Camera, dtype: torch.dtype) -> Candidates:
+    """Return what all rays meet whose eye is inside of shells; in a parallel view every eye is taken to be outside."""
+    pixel = torch.arange(camera.width * camera.height)
+    origin, direction, _ = rays(camera, pixel, torch.float64)
+    origin, nothing = origin.expand(len(pixel), 3), torch.full_like(pixel, -1)
+    found = []
+    for placed in world.shells if camera.projection == "perspective" else ():
+        for tet, place in zip(*shell.around(placed.shell, camera.eye), strict=True):
+            entries = gdm_trace.Entries(origin, direction, tet.expand(len(pixel)), nothing, place.expand(len(pixel), 3))
+            found.append(_met(scene, placed, entries, pixel, nothing, torch.zeros(len(pixel), dtype=dtype)))
+    empty = torch.zeros(0, dtype=dtype)
+    none = Candidates(pixel[:0], pixel[:0], pixel[:0], empty, empty, pixel[:0], empty[:, None].expand(0, 3), empty > 0)
+    return Candidates(*(torch.cat(x) for x in zip(none, *found, strict=True)))
+
+
+def _met(
+    scene: Scene, placed: PlacedShell, entries: gdm_trace.Entries, pixel: Tensor, fragment: Tensor, t: Tensor
+) -> Candidates:
+    """Return where rays of one shell meet material."""
+    dressing = scene.surfaces[placed.surface]
+    traced = gdm_trace.trace(
+        placed.shell, dressing.gdm, entries, queries=dressing.shell.queries, floor=dressing.shell.base == "solid"
+    )
+    depth = torch.maximum(traced.t.to(t.dtype), t)
+    return Candidates(
+        pixel, fragment, torch.full_like(pixel, -1), t, depth, traced.prism + placed.first_tet // 3,
+        traced.place.to(t.dtype), traced.through == BOTTOM,
+    ).select(traced.hit)  # fmt: skip
+
+
 def _meet_gdms(scene: Scene, world: World, camera: Camera, layers: Layers, fragment: Tensor) -> Candidates:
     """Return where rays meet material, that come into shells at `fragment`."""
     found = []
@@ -200,21 +233,11 @@ def _meet_gdms(scene: Scene, world: World, camera: Camera, layers: Layers, fragm
         mine = (owner == placed.surface).nonzero()[:, 0]
         if len(mine) == 0:
             continue
-        own, dressing = fragment[mine], scene.surfaces[placed.surface]
+        own = fragment[mine]
         origin, direction, _ = rays(camera, layers.pixel[own], torch.float64)
         tet, corner = entry[mine] // 4 - placed.first_tet, entry[mine] % 4
         entries = gdm_trace.Entries(origin.expand(len(own), 3), direction, tet, corner)
-        traced = gdm_trace.trace(
-            placed.shell, dressing.gdm, entries, queries=dressing.shell.queries, floor=dressing.shell.base == "solid"
-        )
-        hit = traced.hit.nonzero()[:, 0]
-        t, depth = layers.t[own], traced.t.to(layers.t.dtype)
-        found.append(
-            Candidates(
-                layers.pixel[own], own, torch.full_like(own, -1), t, torch.maximum(depth, t),
-                traced.prism + placed.first_tet // 3, traced.place.to(layers.t.dtype), traced.through == BOTTOM,
-            ).select(hit)
-        )  # fmt: skip
+        found.append(_met(scene, placed, entries, layers.pixel[own], own, layers.t[own]))
     return Candidates(*(torch.cat(x) for x in zip(*found, strict=True)))
 
 
