@@ -27,6 +27,12 @@ MOST_STEPS = 4096
 NUDGES = (1e-9, 1e-7, 1e-5, 1e-3, 0.0)
 """A ray beside the face it comes in by is moved by these shares of the way to its middle, one after the other."""
 
+TIE = 1e-6
+"""Tile units: material that lies at the very end of a way is met."""
+
+SHORT = 1e-5
+"""Ways in texture space, tile units, that rounding makes or leaves out: past an edge or a corner."""
+
 INTO = OUTWARD.flip(1)
 """Corners of the face a ray came in through, counter-clockwise seen by the ray."""
 
@@ -60,7 +66,7 @@ class Traced:
         direction: (n, 3) unit direction of the last way in texture space.
         prism: (n,) the last prism.
         through: (n,) what the ray left through: BOTTOM, TOP, BORDER; 0 where it hit.
-        prisms: (n,) prisms passed.
+        prisms: (n,) prisms passed, those not counted in which the way is shorter than `SHORT`.
     """
 
     hit: Bool[Tensor, "n"]
@@ -98,7 +104,7 @@ def trace(shell: Shell, gdm: Gdm | None, entries: Entries, *, queries: int = 1, 
         start_t[within], start[within] = 0, entries.place[within].double()
     hit, t = torch.zeros(n, dtype=torch.bool), share.t.clone()
     place, direction = share.place.clone(), torch.zeros(n, 3, dtype=torch.float64)
-    prism, through, prisms = tet // 3, torch.zeros(n, dtype=torch.long), torch.ones(n, dtype=torch.long)
+    prism, through, prisms = tet // 3, torch.zeros(n, dtype=torch.long), torch.zeros(n, dtype=torch.long)
     overlooked = _Overlooked(torch.full((n,), torch.inf, dtype=torch.float64), place.clone(), prism.clone())
     active = enters.nonzero()[:, 0]
     through[~enters] = shell.neighbour[tet, corner][~enters]
@@ -114,6 +120,7 @@ def trace(shell: Shell, gdm: Gdm | None, entries: Entries, *, queries: int = 1, 
         way = at.place[now] - start[ray]
         length = way.norm(dim=-1)
         v = way / length.clamp(min=1e-30)[:, None]
+        prisms[ray] += length > SHORT
         direction[ray] = torch.where(length[:, None] > 0, v, direction[ray])
         met, d, near, sunk = _meet(gdm, start[ray], v, length, queries)
         per_length = (at.t[now] - start_t[ray]) / length.clamp(min=1e-30)
@@ -139,7 +146,6 @@ def trace(shell: Shell, gdm: Gdm | None, entries: Entries, *, queries: int = 1, 
         entered = _shares(shell, _Rays(rays.origin[fresh], rays.axes[fresh]), tet[fresh], corner[fresh])
         start[fresh], start_t[fresh] = entered.place, entered.t
         prism[fresh] = tet[fresh] // 3
-        prisms[fresh] += 1
         active = onward
     if floor:
         hit |= through == BOTTOM
@@ -259,7 +265,7 @@ def _meet(
         reach = d[active] + found.distance
         near[active] = d[active] + found.near
         asked += 1
-        beyond = reach > length[active]
+        beyond = reach > length[active] + TIE
         last = (found.distance < voxel) | (asked >= queries)
         stops = ~found.left & ~beyond & last
         met[active[stops]] = True
