@@ -114,6 +114,11 @@ def test_more_bodies_than_scenes_are_still_asked(rng, monkeypatch):
     check(box(low, high, 0.5).geometry, *membership(low, high, rng))
 
 
+def test_a_sphere_is_one_body_in_spite_of_its_poles():
+    meso = generators.spheres()
+    assert len(solid.bodies(meso.geometry, meso.h).unique()) == 6  # floor and four spheres, and what has no area
+
+
 def test_soups_are_baked_to_numbers(rng):
     """Triangles anywhere, some without an area, some three at an edge: sheets, finite tables, no error."""
     corner = torch.rand(60, 3, 3, generator=rng) * torch.tensor([1.5, 1.5, -0.5]) - torch.tensor([0.2, 0.2, 0.0])

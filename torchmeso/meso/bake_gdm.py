@@ -252,11 +252,12 @@ def _occupancy(caster: RayCastGdm, place: Float[Tensor, "n 3"], options: GdmOpti
     offsets = (torch.arange(n) + 0.5) / n - 0.5
     size = torch.tensor([1 / options.texels, 1 / options.texels, caster.h / (options.layers - 1)])
     inside, count = torch.zeros(len(place)), torch.zeros(len(place))
-    for offset in torch.cartesian_prod(offsets, offsets, offsets).reshape(-1, 3):
-        point = place + offset * size
-        within = (point[:, 2] <= 0) & (point[:, 2] >= -caster.h)
-        inside += caster.inside(point) & within
-        count += within
+    for some in torch.cartesian_prod(offsets, offsets, offsets).reshape(-1, 3).split(max((1 << 15) // len(place), 1)):
+        point = place + some[:, None] * size
+        within = (point[..., 2] <= 0) & (point[..., 2] >= -caster.h)
+        found = caster.inside(point.reshape(-1, 3)).reshape(within.shape)
+        inside += (found & within).sum(0)
+        count += within.sum(0)
     return inside / count.clamp(min=1)
 
 

@@ -68,9 +68,14 @@ def bodies(geometry: Geometry, h: float) -> Int[Tensor, "F"]:
     Triangles that share vertices make a body, if they are closed alone (several, where they fall into closed ones that
     share no edge of two triangles); of the rest those that share such edges, at last all that touch.
     """
-    corners, left = _corners(geometry, h), np.arange(len(geometry.faces))
-    found, n = np.full(len(left), -1), 0
+    corners = _corners(geometry, h)
+    spots = np.concatenate([corners.place[..., None], corners.cell], 2)
+    # Triangles with two corners at one place (the poles of a sphere) bound nothing.
+    left = (spots != np.roll(spots, 1, 1)).any(2).all(1).nonzero()[0]
+    found, n = np.full(len(corners.place), -1), 0
     for way in ("vertices", "edges", "places"):
+        if not len(left):
+            break
         mine = Corners(*(x[left] for x in corners))
         fine = _by_edges(mine)
         if way == "edges":
@@ -81,8 +86,6 @@ def bodies(geometry: Geometry, h: float) -> Int[Tensor, "F"]:
         closed = _closed(mine, part)[part]
         found[left[closed]] = part[closed] + n
         n, left = n + len(left), left[~closed]
-        if not len(left):
-            break
     return torch.from_numpy(found).long()
 
 
