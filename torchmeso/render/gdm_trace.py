@@ -4,6 +4,9 @@ wang2004gdm, section 3.2: in object space a ray passes prisms one after the othe
 is taken as straight, and one look-up tells whether material lies on it. Further look-ups (`queries`) go on from where
 the one before says that nothing is yet, and end closer to the material.
 
+A table decides by the majority of its samples, and may let a ray pass that then begins its way through the next prism
+inside of material. Such a ray met it in the prism before, where the minority told of it.
+
 Test: tests/render/test_gdm_trace.py
 """
 
@@ -90,6 +93,7 @@ def trace(shell: Shell, gdm: Gdm | None, entries: Entries, *, queries: int = 1, 
     hit, t = torch.zeros(n, dtype=torch.bool), share.t.clone()
     place, direction = share.place.clone(), torch.zeros(n, 3, dtype=torch.float64)
     prism, through, prisms = tet // 3, torch.zeros(n, dtype=torch.long), torch.ones(n, dtype=torch.long)
+    overlooked = _Overlooked(torch.full((n,), torch.inf, dtype=torch.float64), place.clone(), prism.clone())
     active = enters.nonzero()[:, 0]
     through[~enters] = shell.neighbour[tet, corner][~enters]
     for _ in range(MOST_STEPS):
@@ -105,11 +109,16 @@ def trace(shell: Shell, gdm: Gdm | None, entries: Entries, *, queries: int = 1, 
         length = way.norm(dim=-1)
         v = way / length.clamp(min=1e-30)[:, None]
         direction[ray] = torch.where(length[:, None] > 0, v, direction[ray])
-        met, d = _meet(gdm, start[ray], v, length, queries)
-        part = torch.where(length > 0, d / length.clamp(min=1e-30), 0)
-        t[ray] = torch.where(met, start_t[ray] + part * (at.t[now] - start_t[ray]), at.t[now])
+        met, d, near, sunk = _meet(gdm, start[ray], v, length, queries)
+        per_length = (at.t[now] - start_t[ray]) / length.clamp(min=1e-30)
+        t[ray] = torch.where(met, start_t[ray] + d * per_length, at.t[now])
         place[ray] = torch.where(met[:, None], start[ray] + d[:, None] * v, at.place[now])
         hit[ray] = met
+        before = ray[sunk & overlooked.t[ray].isfinite()]
+        t[before], place[before], prism[before] = (x[before] for x in overlooked)
+        passed = torch.where(near <= length, start_t[ray] + near.clamp(max=1e30) * per_length, torch.inf)
+        overlooked.t[ray], overlooked.prism[ray] = passed, prism[ray]
+        overlooked.place[ray] = start[ray] + torch.where(near <= length, near, 0)[:, None] * v
         gone = ~met & (ahead[now] < 0)
         through[ray[gone]] = ahead[now][gone]
         done = torch.zeros(len(active), dtype=torch.bool)
@@ -129,6 +138,14 @@ def trace(shell: Shell, gdm: Gdm | None, entries: Entries, *, queries: int = 1, 
     if floor:
         hit |= through == BOTTOM
     return Traced(hit=hit, t=t, place=place, direction=direction, prism=prism, through=through, prisms=prisms)
+
+
+class _Overlooked(NamedTuple):
+    """What rays may have met in the prism before: (n,) t, inf where nothing; (n, 3) place; (n,) prism."""
+
+    t: Tensor
+    place: Tensor
+    prism: Tensor
 
 
 class _Rays(NamedTuple):
@@ -206,25 +223,34 @@ def _facing(shell: Shell, tet: Tensor, before: Tensor) -> Tensor:
     return (shell.neighbour[tet] == before[:, None]).int().argmax(1)
 
 
-def _meet(gdm: Gdm | None, start: Tensor, v: Tensor, length: Tensor, queries: int) -> tuple[Tensor, Tensor]:
-    """Return whether material lies on straight ways in texture space, and how far along."""
+def _meet(
+    gdm: Gdm | None, start: Tensor, v: Tensor, length: Tensor, queries: int
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return whether material lies on straight ways in texture space, and how far along.
+
+    Also how far along it lies by those samples that tell of it, and whether the ways begin inside of it.
+    """
     met, d = torch.zeros(len(start), dtype=torch.bool), torch.zeros(len(start), dtype=torch.float64)
+    near, sunk = torch.full_like(d, torch.inf), torch.zeros_like(met)
     if gdm is None or not len(start):
-        return met, length
+        return met, length, near, sunk
     active, asked = torch.arange(len(start)), 0
     layers, height, width = gdm.voxels
-    near = max(1 / width, 1 / height, gdm.h / (layers - 1))
+    voxel = max(1 / width, 1 / height, gdm.h / (layers - 1))
     while len(active):
         found = gdm.evaluate(start[active] + d[active, None] * v[active], v[active])
         reach = d[active] + found.distance
+        near[active] = d[active] + found.near
         asked += 1
         beyond = reach > length[active]
-        last = (found.distance < near) | (asked >= queries)
+        last = (found.distance < voxel) | (asked >= queries)
         stops = ~found.left & ~beyond & last
         met[active[stops]] = True
+        if asked == 1:
+            sunk = met & (found.distance <= 0)
         # Asked again a voxel before the material, where the table is at its best; and where the table ends before the
         # way does, from there on, whatever the number of queries.
-        step = torch.where(found.left | last, found.distance, found.distance - near)
+        step = torch.where(found.left | last, found.distance, found.distance - voxel)
         d[active] = torch.minimum(d[active] + step, length[active])
         active = active[~stops & ~beyond & (found.distance > 1e-9)]
-    return met, d
+    return met, d, near, sunk

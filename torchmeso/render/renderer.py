@@ -24,12 +24,12 @@ from torchmeso.data import image
 from torchmeso.errors import BackendError, check_memory
 from torchmeso.geometry.camera import Camera
 from torchmeso.geometry.light import DirectionalLight, Light, SpotLight
-from torchmeso.render import device, device_tables, film, shadow_map
+from torchmeso.render import device, device_gdm, device_shell, device_tables, film, shadow_map
 from torchmeso.render.casters import Corners, corners_of
 from torchmeso.render.device_raster import ROOM, STAMPS, DeviceViews
 from torchmeso.render.film import Picture
 from torchmeso.render.frame import MEMORY_LIMIT, FrameOptions
-from torchmeso.render.scene import Scene, World, assemble
+from torchmeso.render.scene import Material, Scene, World, assemble
 
 MAX_LIGHTS = 64
 """Of a frame, as in kernels_cl/render/shadow_map.clh."""
@@ -102,6 +102,7 @@ class Renderer:
             ("-DONE_LAYER", self._one_layer),
             ("-DMIXED", mixed),
             ("-DHARMONICS", self._on_device.materials.harmonic),
+            ("-DGDM", self._on_device.shells is not None),
         )
         self._defines = (f"-DSILHOUETTE={mode}", *(name for name, needed in wanted if needed))
         self._plain = mode == 0 and self.options.silhouette != "none"
@@ -288,7 +289,7 @@ class Renderer:
                 (views.views, views.triangles, views.slots, views.labels, views.boxes, views.coarse, views.counters,
                  geometry.records, geometry.facets, materials.tables, materials.mdfs, np.int32(number),
                  np.int32(views.stride), capacity, np.int32(maps.room), np.int32(self._skip_bits()), *self._layers(),
-                 *maps.stored),
+                 *maps.stored, *self._on_device.of_shells),
                 self._defines,
             )
             for number in range(views.count)
@@ -354,7 +355,7 @@ class Renderer:
              geometry.records, geometry.facets, materials.tables, materials.mdfs, materials.reflectances,
              picture.lights.buffer, lights.views, lights.slots, lights.labels, lights.counters, *stored,
              picture.frame.buffer, *self._layers(),
-             *(b for b, _ in picture.results), picture.empty.buffer),
+             *(b for b, _ in picture.results), picture.empty.buffer, *self._on_device.of_shells),
             (*self._defines, *(["-DSHADOWS"] * self.options.shadows), *(["-DFILTERED"] * self.options.filtering)),
         )  # fmt: skip
 
@@ -368,6 +369,15 @@ class _OnDevice(NamedTuple):
     materials: device_tables.DeviceMaterials
     corners: Corners
     object_of: list[int]  # of each surface
+    shells: device_shell.DeviceShells | None
+    gdms: device_gdm.DeviceGdms | None
+
+    @property
+    def of_shells(self) -> "tuple[opencl.Buffer, ...]":
+        """What kernels are given of them."""
+        if self.shells is None or self.gdms is None:
+            return ()
+        return (*self.shells, self.gdms.tables, self.gdms.gdms)
 
     @property
     def mixed(self) -> bool:
@@ -388,13 +398,27 @@ def _upload(scene: Scene, options: FrameOptions, before: _OnDevice | None = None
         ambient=scene.ambient > 0,
         before=None if before is None else before.materials,
     )
+    gdms = device_gdm.upload_gdms([_dressing(m) for m in scene.surfaces], None if before is None else before.gdms)
     object_of = [i for i, o in enumerate(scene.objects) for _ in o.materials]
     same = before is not None and _are(_meshes(scene), _meshes(before.scene)) and object_of == before.object_of
     if before is not None and same:
-        return before._replace(scene=scene, materials=materials)
+        return before._replace(scene=scene, materials=materials, gdms=gdms)
     world = assemble(scene)
     corners = corners_of(world)
-    return _OnDevice(scene, world, device.upload_geometry(world), materials, corners, object_of)
+    shells = None
+    if world.shells:
+        shells = device_shell.upload_shells([(s.shell, s.mesh, s.first_vertex) for s in world.shells])
+    return _OnDevice(
+        scene, world, device.upload_geometry(world), materials, corners, object_of, shells, gdms if shells else None
+    )
+
+
+def _dressing(material: Material) -> device_gdm.Dressing | None:
+    if material.gdm is None:
+        return None
+    return device_gdm.Dressing(
+        material.gdm, material.gdm.h, material.shell.queries, material.shell.base == "solid", material.albedo
+    )
 
 
 @dataclass(eq=False, kw_only=True)
@@ -449,7 +473,8 @@ class _Picture:
 
 
 def _meshes(scene: Scene) -> list[object]:
-    return [x for o in scene.objects for x in (o.mesh, o.part)]
+    shells = [x for m in scene.surfaces for x in (m.gdm, m.shell)]
+    return [x for o in scene.objects for x in (o.mesh, o.part)] + shells
 
 
 def _depths(scene: Scene) -> list[object]:
@@ -489,4 +514,7 @@ def _named(counts: dict[str, int], camera: Camera) -> dict[str, int]:
         "triangles turned away": counts["turned"],
         "losing fragments not shaded": counts["losers"],
         "shadow tests of what leans away": counts["averted"],
+        "prisms passed": counts["prisms"],
+        "tetrahedra passed": counts["tets"],
+        "rays lost in a shell": counts["endless"],
     }

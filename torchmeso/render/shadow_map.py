@@ -5,6 +5,7 @@ already holds the shadows of its own mesostructure, a blocker must not shadow th
 
     closed surfaces:  shadow starts at t_b, where the ray leaves the body again
     open surfaces:    t_f + s_f h / cos(theta_l), the base of the slab (from behind, and plain ones: t_f)
+    GDMs:             where the ray meets the material; a receiver in a shell lets pass what is nearer than s h
 
 Whatever lies outside a body and behind it is behind t_b, and what lies inside (a receiver in a joint) is not: so
 closed surfaces need no bias against self-shadowing at all, however steep or coarse. The base of the slab, which the
@@ -31,7 +32,7 @@ from torchmeso.geometry.light import DirectionalLight, Light, SpotLight
 from torchmeso.render.casters import Corners, corners_of, extents
 from torchmeso.render.rasterize import Triangles, depth_at, rasterize
 from torchmeso.render.scene import Scene, World, interpolate, rays
-from torchmeso.render.silhouette import Candidates, Silhouette, find_candidates, nearest
+from torchmeso.render.silhouette import Silhouette, find_candidates, nearest
 
 
 class ShadowMap(NamedTuple):
@@ -74,8 +75,14 @@ def build(scene: Scene, world: World, light: Light, *, size: int, silhouette: Si
     )
 
 
-def blocked(shadow: ShadowMap, position: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
-    """Return whether the light is blocked at world positions; positions outside the map are lit."""
+def blocked(
+    shadow: ShadowMap, position: Float[Tensor, "n 3"], slack: Float[Tensor, "n"] | None = None
+) -> Bool[Tensor, "n"]:
+    """Return whether the light is blocked at world positions; positions outside the map are lit.
+
+    A blocker nearer to a position than its `slack` does not count: in a shell, the GDM itself says what shadows near
+    material casts.
+    """
     result = torch.zeros(len(position), dtype=torch.bool)
     for face in shadow.faces:
         camera = face.camera
@@ -91,7 +98,7 @@ def blocked(shadow: ShadowMap, position: Float[Tensor, "n 3"]) -> Bool[Tensor, "
         t = (position[seen] - camera.eye.to(position.dtype)).norm(dim=-1) if perspective else depth[seen]
         start = depth_at(face.triangles, camera, triangle, xy[seen])
         start = start + face.behind[row[seen] * camera.width + column[seen]]
-        result[seen] |= t > start
+        result[seen] |= t > (start if slack is None else start + slack[seen])
     return result
 
 
@@ -100,7 +107,7 @@ def _draw(scene: Scene, world: World, camera: Camera, silhouette: Silhouette) ->
     layers = rasterize(camera, world.vertices, world.faces)
     candidates, _ = find_candidates(scene, world, camera, layers, silhouette, depths=False)
     blockers = (candidates.fragment >= 0).nonzero()[:, 0]  # a light inside a solid lights that solid's surroundings
-    candidates = Candidates(*(x[blockers] for x in candidates))
+    candidates = candidates.select(blockers)
     closed = candidates.back >= 0
     surface = torch.where(closed, candidates.back, candidates.fragment)
     points = interpolate(world, layers, camera, surface)
@@ -119,7 +126,8 @@ def _draw(scene: Scene, world: World, camera: Camera, silhouette: Silhouette) ->
     h = torch.tensor(slabs, dtype=t.dtype)[points.owner]
     textured = layers.triangles.front[layers.triangle[surface]] & (silhouette != "none")
     slab = torch.where(textured, points.scale * h / cosine.clamp(min=MIN_COS), 0)
-    behind = torch.where(closed, inside, slab + bias)
+    met = candidates.prism >= 0
+    behind = torch.where(closed, inside, torch.where(met, candidates.depth - t + bias, slab + bias))
     first = nearest(candidates, t + behind)
     n_pixel = camera.width * camera.height
     triangle, offset = torch.full((n_pixel,), -1), torch.zeros(n_pixel, dtype=behind.dtype)
