@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 import torch
 
+from tests.data.test_gdm import layered
 from tests.render.scenes import scene
 from torchmeso.geometry import mesh, shapes
 from torchmeso.render import casters
 from torchmeso.render.casters import corners_of, extents
-from torchmeso.render.scene import assemble
+from torchmeso.render.scene import Material, Object, Scene, assemble
 
 FROM_ABOVE = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
 
@@ -69,3 +70,12 @@ def test_all_but_the_largest_of_many_sheets_count_as_bodies(monkeypatch):
     found = corners(*(moved(shapes.plane(size=(s, s)), y=k) for k, s in enumerate(sizes)))
     assert [float(np.ptp(x[0])) for x in found.flats] == pytest.approx([4, 3])
     assert found.bodies.shape[1] == 8
+
+
+def test_a_shell_on_a_sheet_is_a_body():
+    """What stands in it casts shadows on the rest."""
+    material = Material(gdm=layered(-0.2))
+    floor = Object(mesh=shapes.plane(size=(4, 4), triangles=8), material=material)
+    found = corners_of(assemble(Scene(objects=(floor,), lights=())))
+    assert not found.flats
+    assert float(np.ptp(found.bodies[1])) > 0
