@@ -2,8 +2,8 @@
 
 Raw tables (.btf.zarr, .mdf.zarr) are Zarr 3 groups filled block by block; a job that was cut off leaves
 `<name>.part` with the blocks it finished, and the same job goes on from there. Zarr reads a missing block as zeros;
-ours are all written, black ones too, and a finished table that lacks one is refused where it is opened. Run-time models (.meso) are
-safetensors files, one tensor per component, memory-mapped: what is not asked for is never read.
+ours are all written, black ones too, and a finished table that lacks one is refused where it is opened. Run-time
+models (.meso) are safetensors files, one tensor per component, memory-mapped: what is not asked for is never read.
 
 Test: tests/data/test_store.py
 """
@@ -151,7 +151,8 @@ def _check_blocks(path: Path, group: zarr.Group) -> None:
     for name, array in sorted(group.arrays()):
         grid = [-(-size // block) for size, block in zip(array.shape, array.shards or array.chunks, strict=True)]
         folder = path / name / "c"
-        found = {Path(root, file).relative_to(folder).as_posix() for root, _, files in os.walk(folder) for file in files}
+        files = (Path(root, file) for root, _, files in os.walk(folder) for file in files)
+        found = {file.relative_to(folder).as_posix() for file in files}
         count = math.prod(grid)
         if len(found) < count:
             # One after the other: a damaged file may ask for more than a list could hold.
