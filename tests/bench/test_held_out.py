@@ -30,7 +30,7 @@ def test_ours_is_the_lowest():
     for name in ("ubo81", "grid(12, 5, 80)"):
         for side in ("lights", "views"):
             rows = list(held_out._side("weave", hemisphere.parse(name), side, 8, 20))
-            assert [row.id.split(".")[-1] for row in rows][:3] == ["eigen", "harmonics", "nearest"]
+            assert [row.id.split(".")[-1] for row in rows][:4] == ["eigen", "harmonics", "sh-pca", "nearest"]
             assert [row.met for row in rows if row.goal is not None] == [True]
 
 

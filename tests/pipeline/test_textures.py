@@ -8,10 +8,11 @@ from PIL import Image
 
 from torchmeso.algebra.spherical_harmonics import basis
 from torchmeso.cli import main
-from torchmeso.compress import double_sh, eigen
+from torchmeso.compress import double_sh, eigen, sh_pca
 from torchmeso.compress.double_sh import DoubleShOptions
 from torchmeso.compress.eigen import EigenOptions
-from torchmeso.data import eigen_btf, image, sh_btf
+from torchmeso.compress.sh_pca import ShPcaOptions
+from torchmeso.data import eigen_btf, image, sh_btf, sh_pca_btf
 from torchmeso.data.btf import Btf
 from torchmeso.data.mdf import Mdf
 from torchmeso.errors import ConfigError, StorageError
@@ -79,6 +80,21 @@ def test_harmonics_are_put_together_from_their_textures(table, tmp_path):
     torch.testing.assert_close(T, expected, rtol=0, atol=1e-5)
 
 
+@pytest.mark.parametrize("storage", ["uint8", "float16"])
+def test_components_are_put_together_from_their_textures(table, tmp_path, storage):
+    model = sh_pca.fit(table, ShPcaOptions(rank=3, light_terms=4, storage=storage))
+    sh_pca_btf.save(model, tmp_path / "a.meso")
+    textures.write(tmp_path / "a.meso", tmp_path / "maps")
+    about = json.loads((tmp_path / "maps" / "maps.json").read_text())["btf"]
+    y, v = basis(SET.directions(), 1)[3], 4
+    T = torch.zeros(4, 6, 3)
+    for k in range(3):
+        W = picture(tmp_path / "maps" / "sh_pca" / f"k{k:02d}_v{v:03d}{about['files'].partition(':')[0][-4:]}")
+        T += (about["offset"][k] + about["scale"][k] * W) * (y @ torch.tensor(about["basis"][k]))
+    expected = torch.einsum("hwk,kmc,m->hwc", model.decoded()[v], model.basis, y)
+    torch.testing.assert_close(T, expected, rtol=0, atol=1e-5)
+
+
 def test_a_folder_that_stood_there_is_replaced_whole(table, tmp_path):
     eigen_btf.save(eigen.fit(table, EigenOptions(rank=1)), tmp_path / "a.meso")
     (tmp_path / "maps").mkdir()
@@ -106,5 +122,5 @@ def test_a_full_disk_is_one_sentence_and_leaves_what_stood_there(table, tmp_path
 @pytest.mark.errors
 def test_a_model_without_maps_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(textures, "open_model", lambda path: Material())
-    with pytest.raises(ConfigError, match="expected an eigen or a double-SH BTF, got NoneType"):
+    with pytest.raises(ConfigError, match="expected a compressed BTF, got NoneType"):
         textures.write(tmp_path / "a.meso", tmp_path / "maps")

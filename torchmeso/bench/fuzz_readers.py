@@ -20,16 +20,33 @@ import torch
 from torchmeso.bench import fuzz
 from torchmeso.bench.fuzz import Kind, damaged_bytes
 from torchmeso.bench.suite import Context, Measurement, Row, resident_peak
-from torchmeso.compress import dfmf, double_sh
+from torchmeso.compress import dfmf, double_sh, eigen, transform
 from torchmeso.compress import rti as rti_fit
 from torchmeso.compress.dfmf import DfmfOptions
 from torchmeso.compress.double_sh import DoubleShOptions
-from torchmeso.data import btf_file, btfdbb_write, exr_stack, hsh, image, picture_set, ptm, rgbe, rti, sh_btf, ubo2003
+from torchmeso.compress.eigen import EigenOptions
+from torchmeso.compress.transform import TransformOptions
+from torchmeso.data import (
+    btf_file,
+    btfdbb_write,
+    eigen_btf,
+    exr_stack,
+    hsh,
+    image,
+    picture_set,
+    ptm,
+    rgbe,
+    rti,
+    sh_btf,
+    transform_btf,
+    ubo2003,
+)
 from torchmeso.data.btf import Btf
 from torchmeso.data.rti import LightSet
 from torchmeso.errors import MesoError
 from torchmeso.geometry import hemisphere
 from torchmeso.meso import textile
+from torchmeso.pipeline import describe
 from torchmeso.pipeline.bake import open_model
 
 SET = hemisphere.grid(5, 2, 70)
@@ -148,6 +165,22 @@ def harmonics(folder: Path) -> Files:
     return {"a.meso": (path.read_bytes(), open_model)}
 
 
+def streams(folder: Path) -> Files:
+    """Run-time models whose codes are streams: transform-coded, and adaptive eigen and double SH."""
+    table = _table()
+    transform_btf.save(transform.fit(table, TransformOptions(psnr=30.0))[0], folder / "transform.meso")
+    options = EigenOptions(rank=4, storage="adaptive")
+    eigen_btf.save(eigen.fit(table, options), folder / "eigen.meso", coded=True)
+    harmonic = double_sh.fit(table, DoubleShOptions(light_terms=4, view_terms=4, storage="adaptive"))
+    sh_btf.save(harmonic, folder / "sh.meso", coded=True)
+
+    def read(path: Path) -> None:
+        open_model(path)
+        describe.file(path)
+
+    return {name: ((folder / name).read_bytes(), read) for name in ("transform.meso", "eigen.meso", "sh.meso")}
+
+
 def _table() -> Btf:
     return Btf(images=torch.rand(10, 10, 3, 4, 3, generator=torch.Generator().manual_seed(0)), lights=SET, views=SET)
 
@@ -185,6 +218,7 @@ def weaves(folder: Path) -> Files:
 FAMILIES: dict[str, Callable[[Path], Files]] = {
     "bonn": bonn, "pictures": pictures, "sets": sets, "relighting": relighting, "harmonics": harmonics,
     "weaves": weaves,
+    "streams": streams,
 }  # fmt: skip
 
 

@@ -21,9 +21,10 @@ from torch import Tensor
 from torchmeso.algebra import secular
 from torchmeso.algebra.spherical_harmonics import basis, degree_of
 from torchmeso.bench.suite import Context, Measurement, Row
-from torchmeso.compress import double_sh, eigen
+from torchmeso.compress import double_sh, eigen, sh_pca
 from torchmeso.compress.double_sh import DoubleShOptions
 from torchmeso.compress.eigen import EigenOptions
+from torchmeso.compress.sh_pca import ShPcaOptions
 from torchmeso.data import image, ubo2003
 from torchmeso.data.address import texel_centres
 from torchmeso.data.btf import Evaluable
@@ -41,6 +42,9 @@ FEW = "rings(10: 1 @ 40, 40: 1 @ 200, 62: 1 @ 300)"
 """Directions of the other side: random ones of one side are asked for at each of these."""
 
 SEED = 3
+
+SH_PCA = ShPcaOptions(rank=75, storage="float32", regularise=True)
+"""All components of 25 coefficients: the few lights that random views are asked for under tell no more than theirs."""
 
 
 def peers(known: Float[Tensor, "known 3"], asked: Float[Tensor, "asked 3"]) -> dict[str, Weights]:
@@ -113,6 +117,7 @@ def _side(material: str, directions: DirectionSet, side: str, texels: int, count
     found = {
         "eigen": _error(_shown(model, truth), expected),
         "harmonics": _error(_harmonics(directions, T, wanted).movedim(0, axis), expected),
+        "sh-pca": _error(_shown(sh_pca.fit(table, SH_PCA), truth), expected),
     }
     theirs = {name: _error(_mixed(w, T).movedim(0, axis), expected) for name, w in peers(known, wanted).items()}
     place = f"compress.held_out.baked.{material}.{directions.name.partition('(')[0]}.{side}"

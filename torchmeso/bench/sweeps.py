@@ -14,9 +14,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchmeso.bench.suite import Context, Measurement, Row
-from torchmeso.compress import double_sh, eigen
+from torchmeso.compress import double_sh, eigen, sh_pca
 from torchmeso.compress.double_sh import DoubleShOptions
 from torchmeso.compress.eigen import EigenOptions
+from torchmeso.compress.sh_pca import ShPcaOptions
 from torchmeso.data.btf import Btf
 from torchmeso.data.hsh import Hsh
 from torchmeso.data.mdf import Mdf
@@ -77,6 +78,7 @@ def curves() -> dict[str, Curve]:
             "btf": table,
             "eigen": eigen.fit(table, EigenOptions(rank=8)),
             "double-sh": double_sh.fit(table, DoubleShOptions(light_terms=terms, view_terms=terms)),
+            "sh-pca": sh_pca.fit(table, ShPcaOptions(rank=8, light_terms=terms)),
         }
         for kind, model in models.items():
             key = f"{kind}.{name.partition('(')[0]}"

@@ -1,7 +1,8 @@
 """The maps of a run-time model as textures, with a small JSON of what they are: for engines that know no `.meso`.
 
 A folder holds, of an eigen BTF, a picture per component and light (`eigen/k00_l000.png`); of a double-SH BTF one per
-pair of coefficients (`sh/i00_j00.png`), each with the formula that puts them together, scales, offsets, directions
+pair of coefficients (`sh/i00_j00.png`), of an SH + PCA BTF a grey one per component and view
+(`sh_pca/k00_v000.png`), each with the formula that puts them together, scales, offsets, directions
 and weights in `maps.json`. Codes of 8 bits become PNG, value for value, floats become EXR. For engines that only want
 the usual maps there are `ambient.exr` (what even light from everywhere shows from above, linear), and where the
 model has an MDF `height.exr` (depth below the reference plane in tile units, minus, as displacement maps have it) and
@@ -25,12 +26,17 @@ from torchmeso.data.address import texel_centres
 from torchmeso.data.eigen_btf import EigenBtf
 from torchmeso.data.mdf import Mdf
 from torchmeso.data.sh_btf import ShBtf
+from torchmeso.data.sh_pca_btf import ShPcaBtf
 from torchmeso.errors import ConfigError
 from torchmeso.geometry import gaps
 from torchmeso.geometry.hemisphere import DirectionSet
 from torchmeso.pipeline.bake import Report, open_model, silent
 
 EIGEN = "T(wi, wo) = sum_k W_k(wo) (offset_k + scale_k E_k(wi)), E_k interpolated between lights, W_k between views"
+SH_PCA = (
+    "T(wi, wo) = sum_km (offset_k + scale_k W_k(wo)) b_kmc y_m(wi), real spherical harmonics, (l, m) order, W_k "
+    "interpolated between views"
+)
 HARMONICS = "T(wi, wo) = sum_ij (offset_ij + scale_ij C_ij) y_i(wi) y_j(wo), real spherical harmonics, (l, m) order"
 
 
@@ -57,8 +63,10 @@ def write(path: str | Path, folder: str | Path, report: Report = silent) -> None
             about["btf"] = _eigen(found.btf, beside, report)
         elif isinstance(found.btf, ShBtf):
             about["btf"] = _harmonic(found.btf, beside, report)
+        elif isinstance(found.btf, ShPcaBtf):
+            about["btf"] = _components(found.btf, beside, report)
         else:
-            raise ConfigError(f"{path}: expected an eigen or a double-SH BTF, got {type(found.btf).__name__}")
+            raise ConfigError(f"{path}: expected a compressed BTF, got {type(found.btf).__name__}")
         uv = texel_centres(*found.btf.texels).reshape(-1, 2)
         up = torch.tensor([0.0, 0, 1]).expand(len(uv), 3)
         image.write_exr(beside / "ambient.exr", found.btf.ambient(uv, up).unflatten(0, found.btf.texels))
@@ -93,6 +101,19 @@ def _harmonic(model: ShBtf, folder: Path, report: Report) -> dict[str, Any]:
         "formula": HARMONICS, "files": f"sh/i00_j00{_suffix(model.maps)}: light's and view's coefficient",
         "code_unit": _unit(model.maps), "last_light_deg": model.lights.theta_deg[-1],
         "last_view_deg": model.views.theta_deg[-1], "scale": model.scale.tolist(), "offset": model.offset.tolist(),
+    }  # fmt: skip
+
+
+def _components(model: ShPcaBtf, folder: Path, report: Report) -> dict[str, Any]:
+    (folder / "sh_pca").mkdir()
+    for k in range(model.rank):
+        for v in range(len(model.views)):
+            _texture(folder / "sh_pca" / f"k{k:02d}_v{v:03d}", model.maps[v, :, :, k, None].expand(-1, -1, 3))
+        report("textures", (k + 1) / model.rank)
+    return {
+        "formula": SH_PCA, "files": f"sh_pca/k00_v000{_suffix(model.maps)}: component, view, the same in all channels",
+        "code_unit": _unit(model.maps), "last_light_deg": model.lights.theta_deg[-1], "views_deg": _angles(model.views),
+        "scale": model.scale.tolist(), "offset": model.offset.tolist(), "basis": model.basis.tolist(),
     }  # fmt: skip
 
 
