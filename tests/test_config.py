@@ -150,6 +150,9 @@ REFUSED = [
     (minimal(render={"shadow_map_size": 1}), r"render\.shadow_map_size: expected a value from 8"),
     (minimal(camera={"eye": [0, 0, 1], "width": "wide"}), r"camera\.width: .*got 'wide'"),
     ({"materials": {"clay": {"albedo": [1, 1, 1]}}, "camera": {"eye": [0, 0, 1]}}, "'objects' is missing"),
+    (minimal(materials={"clay": {"albedo": [1, 1, 1], "gdm": {}}}), "'gdm' says how to bake a 'meso'"),
+    (minimal(materials={"clay": {"albedo": [1, 1, 1], "floor": [1, 1, 1]}}), "'shell' and 'floor' belong to a 'gdm'"),
+    (minimal(materials={"clay": {"meso": {"type": "weave"}, "gdm": {}, "shell": {"base": "x"}}}), "got 'x'"),
 ]
 
 

@@ -135,3 +135,35 @@ def test_the_rank_of_a_model(tmp_path):
     assert bake.prepare(small(**content))["brick"].material.btf.rank == 1
     with pytest.raises(ConfigError, match="'rank' belongs to a 'model'"):
         small(materials={"brick": {"albedo": [1, 1, 1], "rank": 1}, "clay": {"albedo": [0.5, 0.5, 0.5]}})
+
+
+SHELLED = {
+    "weave": {
+        "meso": {"type": "weave"}, "gdm": {"texels": 16, "layers": 6, "n_theta": 8, "n_phi": 12},
+        "shell": {"side": "outward", "queries": 2}, "floor": [0.1, 0.2, 0.3],
+    }
+}  # fmt: skip
+
+
+def in_shells(material=None):
+    torus = {"shape": "torus", "options": {"triangles": 300}, "tiles": [4, 2], "material": "weave"}
+    return small(materials={"weave": material or SHELLED["weave"]}, objects=[torus])
+
+
+def test_a_material_in_a_shell_is_a_gdm(cache, tmp_path):
+    said = []
+    weave = bake.prepare(in_shells(), lambda what, share: said.append(what))["weave"]
+    assert set(said) == {"weave: GDM"}
+    assert weave.material.gdm.voxels == (6, 16, 16)
+    assert weave.material.shell.side == "outward"
+    assert weave.material.albedo == (0.1, 0.2, 0.3)
+    assert set(weave.seconds) == {"gdm"}
+    assert weave.raw_bytes == weave.model_bytes > 0
+    said.clear()
+    assert not bake.prepare(in_shells())["weave"].seconds
+    (path,) = bake.bake_tables("weave", in_shells().materials["weave"], bake.silent, {}, out=tmp_path)
+    assert path.name == "weave.gdm.zarr"
+    given = bake.prepare(in_shells({"model": str(path), "shell": {"base": "open"}}))["weave"]
+    assert given.material.shell.base == "open"
+    assert given.material.gdm.voxels == (6, 16, 16)
+    assert given.raw_bytes == 0

@@ -89,3 +89,25 @@ def test_parts_and_instances_are_told_by_object(tmp_path):
     assert (picture.owner == found.owner).double().mean() > 0.95
     red = (found.rgb[..., 0] > 2 * found.rgb[..., 1]) & (found.owner >= 0)
     assert set(found.owner[red].tolist()) == {0, 1}
+
+
+@pytest.mark.parametrize("side", ["inward", "outward"])
+def test_a_shell_has_a_floor_and_stands_on_its_side(side):
+    """Pipes leave the ground free; where the mesh is the bottom of the shell, the floor lies on it."""
+    weave = {
+        "meso": {"type": "pipes"}, "gdm": {"texels": 8, "layers": 4}, "shell": {"side": side}, "floor": [1.0, 0.0, 0.0],
+    }  # fmt: skip
+    plane = {"shape": "plane", "options": {"size": [8, 8]}, "tiles": [8, 8], "material": "pipe"}
+    settings = small(
+        materials={"pipe": weave}, objects=[plane], lights=[], ambient=1.0,
+        camera={"eye": [0, 6, 0.01], "width": 48, "height": 36}, truth={"samples": 4, "bounces": 0, "max_edge": 0.5},
+    )  # fmt: skip
+    found = truth.render(settings)
+    red = (found.rgb[..., 0] > 5 * found.rgb[..., 1].clamp(min=1e-3)) & (found.owner == 0)
+    assert red.any()
+    h = settings.materials["pipe"].meso.build().h
+    assert float(found.depth[18, 24]) == pytest.approx(6, abs=h + 0.05)
+    floor = 6.0 if side == "outward" else 6.0 + h
+    origin, direction, _ = settings.camera.build().rays(settings.camera.build().pixel_centres())
+    height = (origin + found.depth[..., None] * direction)[..., 1][red]
+    torch.testing.assert_close(height, torch.full_like(height, 6.0 - floor), rtol=0, atol=1e-3)

@@ -1,5 +1,7 @@
+import pytest
 import torch
 
+from torchmeso.errors import BackendError
 from torchmeso.geometry import shapes, shell
 from torchmeso.geometry.shell import OUTWARD
 from torchmeso.render import device_shell
@@ -43,3 +45,10 @@ def test_shares_of_a_prism_follow_its_texture_coordinates(rng):
         got = torch.from_numpy(records["base"]).double() + (way * torch.from_numpy(records[name]).double()).sum(1)
         torch.testing.assert_close(got, share[:, k], rtol=0, atol=1e-4)
     assert torch.equal(torch.from_numpy(records["corner"]).long(), corner + 7)
+
+
+def test_more_prisms_than_a_code_can_name(monkeypatch):
+    mesh, own = built()
+    monkeypatch.setattr(device_shell, "MOST_TETS", 30)
+    with pytest.raises(BackendError, match="at most 10 prisms"):
+        device_shell.upload_shells([(own, mesh, 0)])

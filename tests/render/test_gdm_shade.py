@@ -147,6 +147,7 @@ def test_near_material_casts_shadows_and_far_material_through_the_map(weave):
     assert black[0] > 1.5 * black[1]
 
 
+@pytest.mark.errors
 def test_a_material_is_of_one_kind(weave):
     with pytest.raises(ConfigError, match="a GDM alone"):
         Material(gdm=weave, btf=object())  # type: ignore[arg-type]

@@ -202,7 +202,7 @@ class _Reader:
         about = self.json["materials"][material]
         textures = about.get("pbrMetallicRoughness", {}).get("baseColorTexture"), about.get("normalTexture")
         matrices = [self.transform(texture) for texture in textures if texture]
-        if len(matrices) == 2 and not np.array_equal(*matrices):
+        if len(matrices) == 2 and not np.array_equal(matrices[0], matrices[1]):
             warnings.warn(
                 f"{self.path.name}: its normal map is laid by other texture coordinates than its colours; "
                 "it is laid as they are",

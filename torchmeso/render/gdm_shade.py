@@ -48,6 +48,12 @@ class Met(NamedTuple):
     scale: Float[Tensor, "n"]
     owner: Int[Tensor, "n"]
 
+    def select(self, which: Tensor) -> "Met":
+        """Return the points `which` (numbers or a mask)."""
+        frame = Frame(*(x[which] for x in self.frame))
+        rest = (x[which] for x in (self.scale, self.owner))
+        return Met(self.position[which], self.place[which], self.floor[which], frame, *rest)
+
 
 def points(
     world: World,
@@ -104,7 +110,7 @@ def shade(
         mine = (met.owner == i).nonzero()[:, 0]
         if dressing.gdm is None or len(mine) == 0:
             continue
-        own = Met(*(x[mine] if isinstance(x, Tensor) else Frame(*(y[mine] for y in x)) for x in met))
+        own = met.select(mine)
         matter = _matter(dressing.gdm, own, dressing.albedo)
         around = frames.around(matter.normal)
         wo = frames.to_local(around, frames.to_local(own.frame, wo_world[mine]))

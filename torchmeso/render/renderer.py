@@ -491,8 +491,8 @@ class _Picture:
 
 
 def _meshes(scene: Scene) -> list[object]:
-    shells = [x for m in scene.surfaces for x in (m.gdm, m.shell)]
-    return [x for o in scene.objects for x in (o.mesh, o.part)] + shells
+    shells: list[object] = [x for m in scene.surfaces for x in (m.gdm, m.shell)]
+    return [*shells, *(x for o in scene.objects for x in (o.mesh, o.part))]
 
 
 def _depths(scene: Scene) -> list[object]:
