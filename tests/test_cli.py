@@ -90,6 +90,14 @@ def test_from_a_mesostructure_to_a_model(tmp_path):
     assert "PSNR when fitted (dB): 35." in run("info", model).stdout
     assert isinstance(open_model(model, rank=2).btf, EigenBtf)
     assert run("compress", btf_path, "--method", "transform", "--size", "40kB", *budget[4:]).exit_code == 0
+    for storage in ("uint8", "adaptive"):
+        asked = ("--method", "eigen", "--psnr", 30, "--storage", storage, *budget[4:])
+        said = run("compress", btf_path, *asked).stdout
+        assert "PSNR 3" in said and "of 8\n" in said
+        assert "PSNR when fitted (dB): 3" in run("info", model).stdout
+        asked = ("--method", "double-sh", "--size", "20kB", "--unbounded", "--storage", storage, *budget[4:])
+        assert " coefficients of light and view" in run("compress", btf_path, *asked).stdout
+    assert open_model(model).mdf.texels == (16, 16)
 
 
 def test_from_pictures_to_a_model(tmp_path):
@@ -161,7 +169,9 @@ REFUSED = [
     (["compress", "a", "--energy", "2", "--out", "x.meso"], "--method eigen has no --energy"),
     (["compress", "a", "--method", "transform", "--size", "big", "--out", "x.meso"], "a size like 4MB"),
     (["compress", "a", "--method", "transform", "--energy", "2", "--out", "x.meso"], "transform has no --energy"),
-    (["compress", "a", "--psnr", "38", "--out", "x.meso"], "--method eigen has no --psnr"),
+    (["compress", "a", "--method", "sh-pca", "--psnr", "38", "--out", "x.meso"], "--method sh-pca has no --psnr"),
+    (["compress", "a", "--psnr", "38", "--size", "4MB", "--out", "x.meso"], "--psnr or --size, and not both"),
+    (["compress", "a", "--method", "sh-pca", "--storage", "adaptive", "--out", "x.meso"], "has no adaptive steps"),
     (["compress", "a", "--unbounded", "--out", "x.meso"], "--method eigen has no --unbounded"),
     (["compress", "a", "--ridge", "0", "--out", "x.meso"], "--method eigen has no --ridge"),
     (["compress", "a", "--method", "double-sh", "--rank", "3", "--out", "x.meso"], "double-sh has no --rank"),

@@ -1,7 +1,7 @@
 """The command line: one thin function per job. Heavy imports stay inside the functions (torch costs 2 s).
 
 Results go to stdout, one line per product; progress and warnings to stderr. A MesoError becomes one sentence
-and exit status 2; a bug keeps its traceback.
+and exit status 2; a bug keeps its traceback. `compress`, which has the most options, has a file of its own.
 
 Test: tests/test_cli.py
 """
@@ -10,15 +10,14 @@ import json
 import logging
 import sys
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import fields
-from functools import partial
 from typing import Any
 
 import click
 
 from torchmeso.backends.allocator import keep_freed_memory
+from torchmeso.cli_compress import compress
+from torchmeso.console import progress as _progress
+from torchmeso.console import refuse_to_replace as _refuse_to_replace
 from torchmeso.errors import ConfigError, MesoError, StorageError
 
 MESOS = "sheet, groove, spheres, brick, blocks, grid, weave, pipes, chain, grass, squama, peanut, bark"
@@ -156,109 +155,7 @@ def _bake_one(meso: str, out: Any, force: bool, options: dict[str, Any]) -> None
     click.echo(out)
 
 
-@main.command()
-@click.argument("table")
-@click.option(
-    "--method",
-    default="eigen",
-    type=click.Choice(["eigen", "double-sh", "sh-pca", "transform", "ptm", "hsh"]),
-    show_default=True,
-    help="Kind of model; transform: the smallest file, to --psnr or --size; ptm and hsh: of an RTI set (.lp).",
-)
-@click.option("--psnr", type=float, help="transform: least PSNR of the values of T, in dB.")
-@click.option("--size", help="transform: most bytes of the file without an MDF: 4MB, 300kB, 65536.")
-@click.option(
-    "--rank", type=int, help="eigen: components kept, at most the number of views [4]; sh-pca [16]; transform [all]."
-)
-@click.option(
-    "--light-terms", type=int, help="double-sh, sh-pca: coefficients over the light: 1, 4, 9, 16, 25, 36 [25]."
-)
-@click.option("--view-terms", type=int, help="double-sh: coefficients over the view [25].")
-@click.option(
-    "--energy", type=float, help="double-sh: bound of the coefficients' energy, of what the samples show [1]."
-)
-@click.option("--unbounded", is_flag=True, help="double-sh: plain least squares.")
-@click.option("--regularise", is_flag=True, help="double-sh, sh-pca: more coefficients than the directions tell apart.")
-@click.option(
-    "--domain",
-    type=click.Choice(["hemisphere_fit", "sphere_projection"]),
-    help="sh-pca: least squares at the lights, or the projection of a cube map [hemisphere_fit].",
-)
-@click.option("--ridge", type=float, help="sh-pca: how much small coefficients count beside small errors [1e-4].")
-@click.option("--training", type=int, help="sh-pca: vectors to find the components from, drawn at random [all].")
-@click.option("--terms", type=int, help="hsh: 4, 9 or 16 [9].")
-@click.option("--per-channel", is_flag=True, help="ptm: a polynomial for each channel instead of one and a colour.")
-@click.option(
-    "--storage", default="uint8", show_default=True, type=click.Choice(["uint8", "float16", "float32"]), help="Of maps."
-)
-@click.option("--mdf", "silhouette", help="MDF table (.mdf.zarr) to pack into the model.")
-@click.option("--allow-missing", is_flag=True, help="Interpolate pictures that a folder or zip lacks.")
-@click.option("--out", required=True, help="The run-time model (.meso); of ptm .ptm, of hsh .rti.")
-@click.option("--force", is_flag=True, help="Replace an existing model.")
-def compress(
-    table: str,
-    method: str,
-    unbounded: bool,
-    silhouette: str | None,
-    allow_missing: bool,
-    out: str,
-    force: bool,
-    **options: Any,
-) -> None:
-    """Compress a BTF TABLE (.btf.zarr or .btf, a folder or zip of pictures, or an RTI set .lp) into a small model."""
-    from torchmeso.compress import double_sh, eigen, sh_pca, stream, transform
-    from torchmeso.data import journal, mdf, transform_btf
-    from torchmeso.pipeline import picture_sets
-    from torchmeso.pipeline.bake import code_hash
-
-    if method in ("ptm", "hsh"):
-        _relight(table, method, out, force, options)
-        return
-    if not out.endswith(".meso"):
-        raise ConfigError(f"{out}: expected a name that ends in .meso")
-    _refuse_to_replace(out, force)
-    depth = None if silhouette is None else mdf.load(silhouette)
-    given = {name: value for name, value in options.items() if value is not None and value is not False}
-    kinds: dict[str, Any] = {
-        "eigen": eigen.EigenOptions,
-        "double-sh": double_sh.DoubleShOptions,
-        "sh-pca": sh_pca.ShPcaOptions,
-        "transform": transform.TransformOptions,
-    }
-    known = {field.name for field in fields(kinds[method])}
-    if method == "transform" and given["storage"] == "uint8":
-        del given["storage"]  # the default of the others
-    if (wrong := sorted(set(given) - known)) or (unbounded and method != "double-sh"):
-        raise ConfigError(f"compress: --method {method} has no --{(wrong or ['unbounded'])[0].replace('_', '-')}")
-    if unbounded:
-        given["energy"] = None
-    if "size" in given:
-        given["size"] = transform.parse_size(given["size"])
-    chosen = kinds[method](**given)
-    said = out
-    with _progress() as report:
-        source = picture_sets.open_btf(table, report, allow_missing=allow_missing)
-        told = partial(report, f"{method} BTF")
-        if isinstance(chosen, transform.TransformOptions):
-            packed, found = transform.fit(source, chosen, progress=told)
-            transform_btf.save(packed, out, silhouette=depth, psnr=round(found, 2))
-            said = f"{out}  PSNR {found:.1f} dB  {len(packed.codes)} of {len(packed.views)} view components"
-        else:
-            key = f"{journal.state_of(table)} {code_hash()}"
-            stream.fit(source, chosen, out, key=key, silhouette=depth, progress=told)
-    click.echo(said)
-
-
-def _relight(lights: str, method: Any, out: str, force: bool, options: dict[str, Any]) -> None:
-    from torchmeso.pipeline import relight
-
-    own = {"terms", "per_channel", "storage"}  # storage has a default: it was not asked for
-    wrong = sorted(name for name, value in options.items() if name not in own and value not in (None, False))
-    if wrong:
-        raise ConfigError(f"compress: --method {method} has no --{wrong[0].replace('_', '-')}")
-    _refuse_to_replace(out, force)
-    relight.fit(lights, out, method=method, terms=options["terms"], per_channel=options["per_channel"])
-    click.echo(out)
+main.add_command(compress)
 
 
 @main.command()
@@ -429,7 +326,7 @@ def _compare_btf(a: str, b: str, out: str | None, as_json: bool) -> None:
 
 
 @main.command()
-@click.argument("suite", type=click.Choice(["compress", "render", "skip", "stability", "tables"]))
+@click.argument("suite", type=click.Choice(["compress", "gdm", "render", "skip", "stability", "tables"]))
 @click.option("--quick", is_flag=True, help="Fewer repetitions and sweep points; never smaller sizes.")
 @click.option("--prepare", is_flag=True, help="Only bake what the suite needs into the cache.")
 @click.option("--only", multiple=True, help="Rows whose id begins with this; may be repeated.")
@@ -437,11 +334,12 @@ def _compare_btf(a: str, b: str, out: str | None, as_json: bool) -> None:
 @click.option("--plot", "plot_path", help="Draw the curves into this picture (.png, .svg).")
 def bench(suite: str, quick: bool, prepare: bool, only: tuple[str, ...], json_path: str | None, plot_path: Any) -> None:
     """Measure SUITE: accuracy against truth, time against peers in the same run."""
-    from torchmeso.bench import colour, compress, frames, plot, render, skips, stability, tables
+    from torchmeso.bench import colour, compress, frames, gdm, plot, render, skips, stability, tables
     from torchmeso.bench import suite as suites
 
     measurements = {
         "compress": compress.MEASUREMENTS,
+        "gdm": gdm.MEASUREMENTS,
         "render": render.MEASUREMENTS,
         "skip": skips.MEASUREMENTS,
         "stability": stability.MEASUREMENTS,
@@ -482,32 +380,6 @@ def info(file: str | None, device: bool, as_json: bool) -> None:
 
         about = describe.file(str(file))
         click.echo(json.dumps(about) if as_json else "\n".join(f"{k}: {v}" for k, v in about.items()))
-
-
-def _refuse_to_replace(path: Any, force: bool) -> None:
-    from pathlib import Path
-
-    if Path(path).exists() and not force:
-        raise ConfigError(f"{path}: exists already; give --force to replace it")
-
-
-@contextmanager
-def _progress() -> Iterator[Any]:
-    """Yield a report function that draws progress bars on stderr; quiet when stderr is no terminal."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-
-    columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn()
-    console = Console(stderr=True)
-    with Progress(*columns, console=console, disable=not console.is_terminal) as bars:
-        tasks: dict[str, Any] = {}
-
-        def report(what: str, share: float) -> None:
-            if what not in tasks:
-                tasks[what] = bars.add_task(what, total=1.0)
-            bars.update(tasks[what], completed=share)
-
-        yield report
 
 
 def _info_device(as_json: bool) -> None:

@@ -30,10 +30,12 @@ from torchmeso.geometry.mesh_file import Finish
 from torchmeso.geometry.shapes import SHAPES
 from torchmeso.geometry.unwrap import UnwrapOptions
 from torchmeso.meso.bake_btf import BtfOptions
+from torchmeso.meso.bake_gdm import GdmOptions
 from torchmeso.meso.bake_mdf import MdfOptions
 from torchmeso.meso.mesostructure import Mesostructure, Rgb
 from torchmeso.meso.sources import SOURCES, SUFFIXES
 from torchmeso.render.frame import FrameOptions
+from torchmeso.render.scene import ShellOptions
 from torchmeso.render.silhouette import Silhouette
 
 Vector = tuple[float, float, float]
@@ -89,6 +91,8 @@ class MaterialConfig(_Strict):
 
     A BTF becomes an eigen BTF, or a double-SH BTF where `double_sh` is given, or an SH + PCA BTF where `sh_pca` is.
     `rank` reads only that many components of a model; the others stay on disk. `albedo` multiplies `albedo_map`.
+    With `gdm` the mesostructure stands as material of any form in a `shell` instead, above a `floor` of that colour; a
+    `model` may be a baked GDM (.gdm.zarr) too.
     """
 
     meso: MesoConfig | None = None
@@ -103,6 +107,9 @@ class MaterialConfig(_Strict):
     eigen: EigenOptions = Field(default_factory=EigenOptions)
     double_sh: DoubleShOptions | None = None
     sh_pca: ShPcaOptions | None = None
+    gdm: GdmOptions | None = None
+    shell: ShellOptions = Field(default_factory=ShellOptions)
+    floor: Rgb = (0.6, 0.6, 0.6)
 
     @model_validator(mode="after")
     def _check(self) -> "MaterialConfig":
@@ -115,9 +122,18 @@ class MaterialConfig(_Strict):
             raise ValueError("'normal_map' belongs to an 'albedo' or 'albedo_map'")
         if self.double_sh is not None and self.sh_pca is not None:
             raise ValueError("expected at most one of 'double_sh' and 'sh_pca', the kind of model")
+        if self.gdm is not None and self.meso is None:
+            raise ValueError("'gdm' says how to bake a 'meso'; it has none")
+        if self.model_fields_set & {"shell", "floor"} and not self.in_shell:
+            raise ValueError("'shell' and 'floor' belong to a 'gdm' or to a 'model' that is one (.gdm.zarr)")
         if self.rank is not None and self.model is None:
             raise ValueError("'rank' belongs to a 'model'; a 'meso' has 'eigen: {rank: ...}'")
         return self
+
+    @property
+    def in_shell(self) -> bool:
+        """Whether it is a GDM."""
+        return self.gdm is not None or (self.model is not None and self.model.rstrip("/").endswith(".gdm.zarr"))
 
     @property
     def finish(self) -> Finish | None:

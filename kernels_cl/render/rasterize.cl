@@ -30,13 +30,14 @@ static INNER void set_up_part(const int part, const int number, __global const V
             const int2 tag = tags[16 * v + lane];
             labels[s + lane].face = 16 * v + lane;
             labels[s + lane].tag = tag.x;
-            if (tag.y != object) {
-                object = tag.y;
+            const int own = tag.y < 0 ? ~tag.y : tag.y;
+            if (own != object) {
+                object = own;
                 place = overlap(view, objects + object);
                 near_bodies |= place & AROUND && objects[object].body;
             }
             beside |= (place & BESIDE && view->frustum) << lane;
-            hidden |= (view->cull && tag.x & CLOSED && !(place & AROUND)) << lane;
+            hidden |= (tag.y < 0 || (view->cull && tag.x & CLOSED && !(place & AROUND))) << lane;
         }
         aside += __builtin_popcount(beside);
         const int asked = lanes & ~beside;
@@ -99,7 +100,8 @@ static INNER void set_up_part(const int part, const int number, __global const V
 // Sets up 16 VECTORS faces for one view. `slots` triangles of a view stand together, cut ones behind the others.
 __kernel void set_up(__global const View *restrict views, __global const double *restrict vertices,  // (V, 3)
                      __global const int *restrict faces,   // (F, 3)
-                     __global const int2 *restrict tags,   // (F) component << 2 | CLOSED, object
+                     __global const int2 *restrict tags,   // (F) component << 2 | CLOSED; object, ~ of it where a
+                                                           // face is only there for rays that meet its front
                      __global Triangle *restrict triangles, __global Slot *restrict slots,
                      __global Label *restrict labels,
                      __global int *restrict boxes,         // (4, slots) per view: low x, low y, -high x, -high y

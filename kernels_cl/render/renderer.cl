@@ -2,32 +2,15 @@
 // Host: torchmeso/render/renderer.py
 //
 // Compiled with SILHOUETTE and MIXED (see silhouette.clh), ONE_LAYER, SHADOWS where lights have maps, FILTERED where
-// pixels average what they cover, and HARMONICS where there are double-SH or SH + PCA BTFs.
+// pixels average what they cover, HARMONICS where there are double-SH or SH + PCA BTFs, and GDM where there are shells.
 
 #include "data/sh_pca_btf.clh"
 #include "data/textured.clh"
+#include "render/lights.clh"
 #include "render/shadow_map.clh"
-
-// What a frame asks for.
-typedef struct {
-    int lights, ambient_paper, depths, outputs;  // outputs: OWNER also writes depth, objects and shadows
-    int capacity, skips, stride, pitch;  // pitch: pixels of a row of the picture
-    float ambient, background[3], rank_error;
-    float pixel;  // FILTERED: world width of what a pixel averages, at view depth 1 in perspective
-    int pad[2];
-} Frame;
-#define OWNER 1
-#define DISPLAY 2  // writes bytes to be shown, and nothing else
-
-// A light, and where its shadow map lies.
-typedef struct {
-    int kind;  // 0 directional, 1 point, 2 spot
-    int faces, first_face;
-    float inner, outer;  // cosines of the cone
-    float place[3];      // direction towards the light, or position
-    float axis[3], power[3];
-    int pad[2];
-} Light;
+#ifdef GDM
+#include "render/gdm_shade.clh"
+#endif
 
 // What a frame is shaded with, and where it goes.
 typedef struct {
@@ -49,28 +32,11 @@ typedef struct {
     Ints object;
     Floats depth;
     int seen, inside;
+#ifdef GDM
+    float16 z;       // in the slab
+    int met, floor;  // lanes that show what lies in a shell, and of these its bottom
+#endif
 } Seen;
-
-// Directions from positions to a light, and the share of its power that would arrive there.
-static Vector3 toward(__global const Light *light, const Vector3 *position, float16 *falloff)
-{
-    if (light->kind == 0) {
-        const Vector3 wi = {light->place[0], light->place[1], light->place[2]};
-        *falloff = 1.0f;
-        return wi;
-    }
-    const Vector3 way = {light->place[0] - position->x, light->place[1] - position->y, light->place[2] - position->z};
-    const Vector3 wi = normalize3(way);
-    *falloff = 1.0f / MAX(dot3(way, way), (float16)1e-12f);
-    if (light->kind == 2) {
-        const float16 cosine = -(light->axis[0] * wi.x + light->axis[1] * wi.y + light->axis[2] * wi.z);
-        float16 x = (cosine - light->outer) / MAX(light->inner - light->outer, 1e-6f);
-        x = x > 1.0f ? 1.0f : x;
-        x = x > 0.0f ? x : 0.0f;
-        *falloff *= x * x * (3.0f - 2.0f * x);
-    }
-    return wi;
-}
 
 // The lanes of `bits` whose normals lean towards a light: in the others its shadow decides nothing.
 static int facing(__global const Light *light, const Vector3 *normal, const Vector3 *position, const int bits)
@@ -222,16 +188,33 @@ static void draw_stamp(const Place *place, const Target *target, const Rays *ray
     const float4 background = {frame->background[0], frame->background[1], frame->background[2], 0.0f};
     for (int l = 0; l < 16; l++) colour[l] = seen->seen >> l & 1 ? (float4)(0.0f, 0.0f, 0.0f, 1.0f) : background;
     int blocked[MAX_LIGHTS];
+    float16 slack = 0.0f;
+#ifdef GDM
+    Matter matter;
+    const Place3 in_slab = {seen->at.u, seen->at.v, seen->z};
+    for (int rest = shaded & seen->met; rest;) {
+        int object;
+        const int same = of_one_object(&seen->object, rest, &object);
+        rest &= ~same;
+        slack = from_bits(same) ? place->gdms[object].h * seen->at.scale : slack;
+        material_of(place->gdm_tables, place->gdms + object, &in_slab, seen->floor, same, &matter);
+    }
+#endif
     const float16 d = from_bits(shaded) ? seen->depth.vector : (float16)0.0f;
     const Vector3 receiver = {rays->origin.x + d * rays->direction.x, rays->origin.y + d * rays->direction.y,
                               rays->origin.z + d * rays->direction.z};
     for (int i = 0; i < frame->lights; i++) {
-        const int asked = place->skips & SKIP_FACING && !(frame->outputs & OWNER)
-                        ? facing(lights + i, &seen->at.n, &seen->position, shaded) : shaded;
+        int asked = place->skips & SKIP_FACING && !(frame->outputs & OWNER)
+                  ? facing(lights + i, &seen->at.n, &seen->position, shaded) : shaded;
+#ifdef GDM
+        if (place->skips & SKIP_FACING && !(frame->outputs & OWNER) && seen->met)  // it has normals of its own
+            asked = (asked & ~seen->met) |
+                    faces_light(lights + i, &seen->at, &seen->position, &matter, shaded & seen->met);
+#endif
         tally->averted += __builtin_popcount(shaded & ~asked);
         const int first = lights[i].first_face, count = lights[i].faces;
 #ifdef SHADOWS
-        blocked[i] = asked ? blocked_from(place, &target->shadows, first, count, &receiver, asked) : 0;
+        blocked[i] = asked ? blocked_from(place, &target->shadows, first, count, &receiver, slack, asked) : 0;
 #else
         blocked[i] = 0;
 #endif
@@ -241,7 +224,15 @@ static void draw_stamp(const Place *place, const Target *target, const Rays *ray
     }
     for (int rest = shaded; rest;) {
         int object;
-        const int same = of_one_object(&seen->object, rest, &object);
+        int same = of_one_object(&seen->object, rest, &object);
+#ifdef GDM
+        const int met = same & seen->met;
+        if (met) {
+            shade_shell(place->gdm_tables, place->gdms + object, lights, frame, rays, &seen->at, &seen->position,
+                        seen->z, &matter, met, blocked, colour);
+            same = met;
+        } else
+#endif
         shade_object(place, target->reflectances + object, lights, frame, rays, seen, same, blocked, colour, tally);
         rest &= ~same;
     }
@@ -260,6 +251,42 @@ static void draw_stamp(const Place *place, const Target *target, const Rays *ray
     }
 }
 
+#ifdef GDM
+// What rays meet first in shells that the eye is inside of; returns whether it is inside of any.
+static int look_from_within(const Place *place, const Rays *rays, __global const Frame *frame, const int lanes,
+                            Seen *seen, Tally *tally)
+{
+    for (int i = 0; i < frame->starts; i++) {
+        const int object = frame->start_surface[i];
+        Met met;
+        const int hit = walk(&place->shells, place->gdm_tables, place->gdms + object, &rays->origin, &rays->direction,
+                             (float16)0.0f, lanes, (int16)(frame->start_tet[i] << 2), frame->start_place[i], &met);
+        tally->prisms += met.prisms;
+        tally->tets += met.steps;
+        tally->endless += __builtin_popcount(met.endless);
+        if (i == 0) {
+            const Vector3 up = {0.0f, 0.0f, 1.0f}, along = {1.0f, 0.0f, 0.0f};
+            seen->at = framed(up, along, (float16)1.0f);
+            seen->position = rays->origin;
+        }
+        const int bits = hit & to_bits(met.t.vector < seen->depth.vector);
+        const int16 better = from_bits(bits);
+        const float16 t = MAX(met.t.vector, (float16)0.0f);
+        surface_in_shell(place->shells.prisms, place->records, &met, bits, &seen->at);
+        seen->seen |= bits;
+        seen->met |= bits;
+        seen->floor = (seen->floor & ~bits) | (bits & met.floor);
+        seen->z = better ? met.place.z : seen->z;
+        seen->depth.vector = better ? t : seen->depth.vector;
+        seen->object.vector = better ? (int16)object : seen->object.vector;
+        seen->position.x = better ? rays->origin.x + t * rays->direction.x : seen->position.x;
+        seen->position.y = better ? rays->origin.y + t * rays->direction.y : seen->position.y;
+        seen->position.z = better ? rays->origin.z + t * rays->direction.z : seen->position.z;
+    }
+    return frame->starts > 0;
+}
+#endif
+
 // What the rays of a stamp end on: the nearest of all stretches that stop them.
 static Seen look(const Place *place, const Rays *rays, __global const float16 *key, __global const int16 *slot,
                  const int filled, const int lanes, const Target *target, Tally *tally)
@@ -269,9 +296,16 @@ static Seen look(const Place *place, const Rays *rays, __global const float16 *k
     seen.depth.vector = INFINITY;
     seen.object.vector = -1;
     seen.seen = seen.inside = 0;
+#ifdef GDM
+    seen.met = seen.floor = 0;
+    seen.z = 0.0f;
+#endif
     Ints next;
     next.vector = 0;
-    int active = lanes, first_round = 1, first_seen = 1;
+    int active = filled ? lanes : 0, first_round = 1, first_seen = 1;
+#ifdef GDM
+    first_seen = !look_from_within(place, rays, frame, lanes, &seen, tally);
+#endif
     while (active) {
         Stretches found;
         const int candidates = next_stretches(place, rays, key, slot, filled, &active, &next, &seen.depth, first_round,
@@ -280,10 +314,19 @@ static Seen look(const Place *place, const Rays *rays, __global const float16 *k
         if (!candidates) break;
         int hit = candidates;
         const float16 length = found.t_back.vector - found.t_front.vector;
+#ifdef GDM
+        Met met;
+        int entering;
+        const int missed = pass_shells(place, rays, candidates & ~found.inside, &found, &met, &entering, tally);
+        Surface s = surface_at(place, rays, candidates & ~found.inside & ~entering, found.front);
+        hit &= ~missed;
+        entering &= hit;
+#else
         const Surface s = surface_at(place, rays, candidates & ~found.inside, found.front);
+#endif
         const float16 t = found.t_front.vector;
-        const Vector3 position = {rays->origin.x + t * rays->direction.x, rays->origin.y + t * rays->direction.y,
-                                  rays->origin.z + t * rays->direction.z};
+        Vector3 position = {rays->origin.x + t * rays->direction.x, rays->origin.y + t * rays->direction.y,
+                            rays->origin.z + t * rays->direction.z};
 #if SILHOUETTE != 0
         // How deep the mesostructure lies is asked where it is written, where a shadow may fall, and where it decides
         // what is in front.
@@ -339,10 +382,27 @@ static Seen look(const Place *place, const Rays *rays, __global const float16 *k
         d = interval & (at.vector < d) ? at.vector : d;
 #endif
 #endif
+#ifdef GDM
+        const int16 in_shell = from_bits(entering);
+        const float16 deeper = met.t.vector - found.t_front.vector;
+        d = in_shell ? MAX(deeper, (float16)0.0f) : d;
+#endif
         const float16 depth = found.t_front.vector + d;
         const int16 better = from_bits(hit) & (depth < seen.depth.vector);
         const int bits = to_bits(better);
         // What loses, now or to what was found now, is not shaded.
+#ifdef GDM
+        if (entering) {
+            surface_in_shell(place->shells.prisms, place->records, &met, entering, &s);
+            position.x = in_shell ? rays->origin.x + depth * rays->direction.x : position.x;
+            position.y = in_shell ? rays->origin.y + depth * rays->direction.y : position.y;
+            position.z = in_shell ? rays->origin.z + depth * rays->direction.z : position.z;
+        }
+        const Seen other = {s, position, found.object, {depth}, hit & ~bits, found.inside & hit & ~bits, met.place.z,
+                            entering, entering & met.floor};
+#else
+        const Seen other = {s, position, found.object, {depth}, hit & ~bits, found.inside & hit & ~bits};
+#endif
         const int replaced = seen.seen & bits, beaten = hit & ~bits;
         if (place->skips & SKIP_LOSERS) {
             tally->losers += __builtin_popcount(replaced) + __builtin_popcount(beaten);
@@ -350,11 +410,15 @@ static Seen look(const Place *place, const Rays *rays, __global const float16 *k
             Seen loser = seen;
             loser.seen = replaced;
             if (replaced) draw_stamp(place, target, rays, &loser, tally);
-            const Seen other = {s, position, found.object, {depth}, beaten, found.inside & beaten};
             if (beaten) draw_stamp(place, target, rays, &other, tally);
         }
         seen.seen |= bits;
         seen.inside = (seen.inside & ~bits) | (found.inside & bits);
+#ifdef GDM
+        seen.met = (seen.met & ~bits) | (other.met & bits);
+        seen.floor = (seen.floor & ~bits) | (other.floor & bits);
+        seen.z = better ? other.z : seen.z;
+#endif
         seen.depth.vector = better ? depth : seen.depth.vector;
         seen.object.vector = better ? found.object.vector : seen.object.vector;
         if (first_seen) {
@@ -414,10 +478,10 @@ static INNER void draw_tiles(const int worker, __global const View *restrict vie
                              __global int16 *restrict slot, __global uchar4 *restrict shown,
                              __global float4 *restrict rgba, __global float *restrict depth,
                              __global int *restrict owner, __global uchar *restrict shadowed,
-                             __global uchar *restrict empty)
+                             __global uchar *restrict empty SHELL_PARAMETERS)
 {
     const Place place = {view, slots, labels, records, facets, tables, mdfs, counters->near_bodies, 1,
-                         frame->skips};
+                         frame->skips SHELL_PLACE};
     const Shadows shadows = {light_views, light_slots, light_labels, light_counters,
                              passages, kept_key, kept_slot, blockers};
     const Target target = {frame, reflectances, lights, shadows, shown, rgba, depth, owner, shadowed};
@@ -440,29 +504,30 @@ static INNER void draw_tiles(const int worker, __global const View *restrict vie
             const int x = x0 + 4 * (s % STAMPS), y = y0 + 4 * (s / STAMPS);
             if (x >= view->width || y >= view->height) continue;
             const int filled = lists.filled[s], at = (y >> 2) * (frame->pitch >> 2) + (x >> 2);
-            if (!filled && empty[at] && frame->skips & SKIP_EMPTY) {
+            const int nothing = !filled && !frame->starts;
+            if (nothing && empty[at] && frame->skips & SKIP_EMPTY) {
                 skipped++;
                 continue;
             }
-            empty[at] = !filled;
-            if (!filled) {
+            empty[at] = nothing;
+            if (nothing) {
                 clear_stamp(frame, plane, x, y, background, shown_background, shown, rgba, depth, owner, shadowed);
                 continue;
             }
             const Rays rays = stamp_rays(view, x, y);
             const int lanes = to_bits((x + LX < view->width) & (y + LY < view->height));
             __global const float16 *key_of = key + lists.begin[s];
-            tally.covered += __builtin_popcount(lanes & to_bits(key_of[0] < INFINITY));
+            const int near = filled ? lanes & to_bits(key_of[0] < INFINITY) : 0;
+            tally.covered += __builtin_popcount(near);
             tally.deepest = MAX(tally.deepest, filled);
             for (int k = 0; k < filled; k++)
                 tally.fragments += __builtin_popcount(lanes & to_bits(key_of[k] < INFINITY));
 #ifdef SHADOWS
             // What is seen lies near the first fragment: its shadow is asked for before all else.
-            const int near = lanes & to_bits(key_of[0] < INFINITY);
             const float16 first = view->perspective ? -rays.stretch / key_of[0] : key_of[0];
             const Vector3 nearest = {rays.origin.x + first * rays.direction.x, rays.origin.y + first * rays.direction.y,
                                      rays.origin.z + first * rays.direction.z};
-            for (int i = 0; i < frame->lights; i++)
+            for (int i = 0; near && i < frame->lights; i++)
                 if (lights[i].faces == 1) fetch_shadow_ahead(&shadows, lights[i].first_face, &nearest, near);
 #endif
             const Seen seen = look(&place, &rays, key_of, slot + lists.begin[s], filled, lanes, &target, &tally);
@@ -492,9 +557,10 @@ void draw(__global const View *restrict view, __global const Triangle *restrict 
           __global float *restrict depth,      // (H, pitch)
           __global int *restrict owner,        // (H, pitch)
           __global uchar *restrict shadowed,   // (light, H, pitch)
-          __global uchar *restrict empty)      // (stamps) whether a stamp already shows the background
+          __global uchar *restrict empty       // (stamps) whether a stamp already shows the background
+          SHELL_PARAMETERS)
 {
     draw_tiles(get_group_id(0), view, triangles, slots, labels, boxes, coarse, counters, records, facets, tables,
                mdfs, reflectances, lights, light_views, light_slots, light_labels, light_counters, passages, kept_key,
-               kept_slot, blockers, frame, key, slot, shown, rgba, depth, owner, shadowed, empty);
+               kept_slot, blockers, frame, key, slot, shown, rgba, depth, owner, shadowed, empty SHELL_ARGUMENTS);
 }

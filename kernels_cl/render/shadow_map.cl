@@ -1,7 +1,7 @@
 // The light's pass: the layers of each stamp of a shadow map, or at once what stops the light there.
 // Host: torchmeso/render/shadow_map.py
 //
-// Compiled with SILHOUETTE and MIXED (see silhouette.clh).
+// Compiled with SILHOUETTE and MIXED (see silhouette.clh), and GDM where there are shells.
 
 #include "render/shadow_map.clh"
 
@@ -58,12 +58,13 @@ void draw_light(__global const View *restrict views, __global const Triangle *re
                 __global float16 *restrict key, __global int16 *restrict slot,        // layers of the tiles at work
                 __global Passage *restrict passages,                                  // (stamps of all maps)
                 __global float16 *restrict kept_key, __global int16 *restrict kept_slot,  // (room_to_keep) their layers
-                __global Blockers *restrict blockers)                                 // (stamps of all maps)
+                __global Blockers *restrict blockers                                  // (stamps of all maps)
+                SHELL_PARAMETERS)
 {
     __global const View *view = views + number;
     const int coarse_stride = ((stride >> 4) + 15) >> 4;
     const Place place = {view, slots + view->slots, labels + view->slots, records, facets, tables, mdfs,
-                         counters[number].near_bodies, 0, skips};
+                         counters[number].near_bodies, 0, skips SHELL_PLACE};
     const Shadows shadows = {views, slots, labels, counters, passages, kept_key, kept_slot, blockers};
     draw_light_tiles(get_group_id(0), number, &place, &shadows, triangles + view->slots,
                      boxes + 4 * (view->slots >> 4), coarse + number * 4 * coarse_stride, stride, capacity,

@@ -3,8 +3,9 @@ import math
 import pytest
 import torch
 
-from torchmeso.compress import transform
-from torchmeso.compress.transform import TransformOptions, fit, parse_size, psnr
+from torchmeso.compress import budget, transform
+from torchmeso.compress.budget import psnr
+from torchmeso.compress.transform import TransformOptions, fit
 from torchmeso.data import transform_btf
 from torchmeso.data.btf import Btf
 from torchmeso.errors import ConfigError, SizeError
@@ -63,15 +64,11 @@ def test_black_and_constant_tables_have_models():
         assert found >= 40 and len(model.codes) == 1
 
 
-def test_sizes_are_read():
-    assert [parse_size(x) for x in ("4MB", "300 kB", "65536", "1.5M")] == [4_000_000, 300_000, 65536, 1_500_000]
-
-
 @pytest.mark.errors
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        (TransformOptions(), "expects --psnr or --size"),
+        (TransformOptions(), "--psnr or --size"),
         (TransformOptions(psnr=30, size=3), "and not both"),
         (TransformOptions(psnr=30, rank=19), "expected 1 to 18"),
         (TransformOptions(psnr=30, rank=0), "expected 1 to 18"),
@@ -87,13 +84,7 @@ def test_budgets_that_cannot_be_kept_are_refused(smooth, options, text):
 
 
 @pytest.mark.errors
-def test_words_that_are_no_size_are_refused():
-    with pytest.raises(ConfigError, match="expected a size like 4MB"):
-        parse_size("four")
-
-
-@pytest.mark.errors
 def test_tables_beyond_memory_are_refused(smooth, monkeypatch):
-    monkeypatch.setattr(transform, "MOST_BYTES", 1000)
+    monkeypatch.setattr(budget, "MOST_BYTES", 1000)
     with pytest.raises(SizeError, match="take --method eigen"):
         fit(smooth, TransformOptions(psnr=30))

@@ -8,7 +8,7 @@ from tests.tolerances import FLOAT64
 from torchmeso.data import eigen_btf, mdf, store
 from torchmeso.data.eigen_btf import EigenBtf
 from torchmeso.data.mdf import Mdf
-from torchmeso.errors import FormatError, ShapeError
+from torchmeso.errors import FormatError, MesoError, ShapeError
 from torchmeso.geometry import hemisphere, kriging
 from torchmeso.geometry.directions import from_angles, normalize
 
@@ -106,6 +106,38 @@ def test_round_trip_and_partial_load(tmp_path, rng):
     two = eigen_btf.load(tmp_path / "a.meso", rank=2)
     uv, w = torch.rand(20, 2, generator=rng), normalize(torch.rand(20, 3, generator=rng))
     torch.testing.assert_close(two.evaluate(uv, w, w), eigen.truncated(2).evaluate(uv, w, w))
+
+
+def test_streams_come_back_and_load_alone(tmp_path, rng):
+    eigen = make(rng, dtype=torch.uint8)
+    eigen.maps[..., 1, :] = 0
+    eigen_btf.save(eigen, tmp_path / "a.meso", coded=True)
+    model = store.Model(tmp_path / "a.meso")
+    assert [name for name in model.names() if "code" in name] == ["eigen.code.0", "eigen.code.2"]
+    for rank in (1, 2, 3):
+        back = eigen_btf.load(tmp_path / "a.meso", rank=rank)
+        assert torch.equal(back.maps, eigen.maps[..., :rank, :])
+        assert torch.equal(back.scale, eigen.scale[:rank])
+
+
+@pytest.mark.errors
+def test_streams_that_do_not_hold_the_model_are_refused(tmp_path, rng):
+    path = tmp_path / "a.meso"
+    eigen_btf.save(make(rng, dtype=torch.uint8), path, coded=True)
+    model = store.Model(path)
+    tensors = {name: model.read(name) for name in model.names()}
+    for about, text in (
+        ({"texels": [1 << 20, 1 << 20]}, "expected .* bytes in a stream"),
+        ({"texels": [0, 4]}, "at least one code"),
+        ({"rank": 1 << 60}, "eigen.scale: expected shape"),
+    ):
+        store.write_model(path, tensors, {**model.meta, "eigen": {**model.meta["eigen"], **about}})
+        with pytest.raises(MesoError, match=text):
+            eigen_btf.load(path)
+    del tensors["eigen.code.0"]
+    store.write_model(path, tensors, model.meta)
+    with pytest.raises(FormatError, match=r"expected a tensor 'eigen\.code\.0'"):
+        eigen_btf.load(path)
 
 
 def test_energy_of_the_falloff_is_continuous(rng):

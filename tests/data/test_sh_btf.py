@@ -129,6 +129,17 @@ def test_round_trip_and_fewer_bands(rng, tmp_path):
     assert store.Model(tmp_path / "a.meso").meta["sh"]["domain"] == "hemisphere_fit"
 
 
+def test_streams_come_back_and_fewer_bands_load_alone(rng, tmp_path):
+    m = model(rng, dtype=torch.uint8)
+    m.maps[1, 1:4] = 0
+    m.maps[0, 0] = 0
+    sh_btf.save(m, tmp_path / "a.meso", coded=True)
+    names = store.Model(tmp_path / "a.meso").names()
+    assert "sh.code.1.1" not in names and "sh.code.0.0" in names  # zeros, but the first
+    assert torch.equal(sh_btf.load(tmp_path / "a.meso").maps, m.maps)
+    assert torch.equal(sh_btf.load(tmp_path / "a.meso", degree=1).maps, m.truncated(4, 4).maps)
+
+
 @pytest.mark.errors
 def test_what_does_not_fit_is_refused(rng, tmp_path):
     m = model(rng)

@@ -42,6 +42,37 @@ def test_interrupted_table_goes_on_where_it_stopped(tmp_path):
     assert writer["x"][2, 0] == 2
 
 
+def test_black_blocks_are_written_too(tmp_path):
+    """Zarr leaves blocks of zeros out, and reads what is missing as zeros: the two could not be told apart."""
+    writer = store.open_blocks(tmp_path / "a.zarr", spec(), {"kind": "toy"})
+    for block in range(4):
+        writer["x"][block] = torch.zeros(8).numpy()
+    writer.finish()
+    assert len([p for p in (tmp_path / "a.zarr/x/c").rglob("*") if p.is_file()]) == 4
+    assert not store.read_array(store.open_table(tmp_path / "a.zarr", "toy"), "x").any()
+
+
+@pytest.mark.errors
+def test_a_missing_block_is_named(tmp_path):
+    fill(tmp_path / "a.zarr", range(4)).finish()
+    (tmp_path / "a.zarr/x/c/2/0").unlink()
+    with pytest.raises(FormatError, match=r"a\.zarr: block 2/0 of 'x' is missing, 3 of 4 are there; the copy is"):
+        store.open_table(tmp_path / "a.zarr", "toy")
+    about = tmp_path / "a.zarr/x/zarr.json"  # as a damaged copy may say: nothing is made of that size
+    about.write_text(about.read_text().replace('"shape": [\n    4,', '"shape": [\n    4000000000000000,'))
+    with pytest.raises(FormatError, match="is missing, 3 of 4000000000000000 are there"):
+        store.open_table(tmp_path / "a.zarr", "toy")
+
+
+def test_tables_that_do_not_say_that_all_blocks_are_there_may_lack_some(tmp_path):
+    """Tables by others, and from before blocks of zeros were written."""
+    fill(tmp_path / "a.zarr", range(4)).finish()
+    (tmp_path / "a.zarr/x/c/2/0").unlink()
+    about = tmp_path / "a.zarr/zarr.json"
+    about.write_text(about.read_text().replace('"blocks": "all"', '"blocks": "some"'))
+    assert store.read_array(store.open_table(tmp_path / "a.zarr", "toy"), "x")[:, 0].tolist() == [0, 1, 0, 3]
+
+
 def test_another_job_does_not_resume_it(tmp_path):
     fill(tmp_path / "a.zarr", [0, 2])
     writer = store.open_blocks(tmp_path / "a.zarr", spec(), {"kind": "toy", "samples": 9})
@@ -50,7 +81,7 @@ def test_another_job_does_not_resume_it(tmp_path):
 
 def test_finished_table_replaces_the_old_one(tmp_path):
     fill(tmp_path / "a.zarr", range(4)).finish()
-    fill(tmp_path / "a.zarr", [1], {"run": 2}).finish()
+    fill(tmp_path / "a.zarr", range(4), {"run": 2}).finish()
     assert store.open_table(tmp_path / "a.zarr", "toy").attrs["run"] == 2
     assert [p.name for p in tmp_path.iterdir()] == ["a.zarr"]
 

@@ -166,6 +166,45 @@ def test_textures_for_another_set_are_told(tmp_path):
         mesh_file.read(write(tmp_path / "a.gltf", content))
 
 
+def laid(**transforms):
+    """The square with a material whose textures are `transforms`: base, normal."""
+    about = {k: {"index": 0, "extensions": {"KHR_texture_transform": x}} for k, x in transforms.items()}
+    material = {"pbrMetallicRoughness": {"baseColorTexture": about["base"]}} if "base" in about else {}
+    material |= {"normalTexture": about["normal"]} if "normal" in about else {}
+    content = document(materials=[material], textures=[{"source": 0}], images=[{"uri": "a.png"}])
+    content["extensionsRequired"] = ["KHR_texture_transform"]
+    content["meshes"][0]["primitives"][0]["material"] = 0
+    return content
+
+
+@pytest.mark.parametrize("texture", ["base", "normal"])
+def test_a_texture_that_is_shifted_and_repeated(tmp_path, texture):
+    """On a square whose texture coordinates are its positions; v of the file runs down from the top."""
+    found = mesh_file.read(write(tmp_path / "a.gltf", laid(**{texture: {"offset": [0.25, 0.5], "scale": [2, 3]}})))
+    x, y = found.vertices[:, 0], found.vertices[:, 1]
+    expected = torch.stack([2 * x + 0.25, 1 - (3 * (1 - y) + 0.5)], -1)
+    torch.testing.assert_close(found.uv.double(), expected)
+    assert found.tangents is not None
+
+
+def test_texture_coordinates_are_turned_counter_clockwise(tmp_path):
+    """A quarter turn takes +u, to the right, to up: to smaller v of the file, larger v of ours."""
+    content = laid(base={"rotation": math.pi / 2, "scale": [2, 1]})
+    found = mesh_file.read(write(tmp_path / "a.gltf", content))
+    x, y = found.vertices[:, 0], found.vertices[:, 1]
+    torch.testing.assert_close(found.uv.double(), torch.stack([1 - y, 1 + 2 * x], -1), rtol=0, atol=1e-6)
+    assert found.tangents is None
+    body = mesh.dress_file(found)
+    torch.testing.assert_close(body.tangents[0], torch.tensor([0.0, -1.0, 0.0]), rtol=0, atol=1e-6)
+
+
+def test_colours_lead_where_a_normal_map_is_laid_otherwise(tmp_path):
+    content = laid(base={"scale": [2, 2]}, normal={"scale": [3, 3]})
+    with pytest.warns(UserWarning, match="laid as they are"):
+        found = mesh_file.read(write(tmp_path / "a.gltf", content))
+    assert float(found.uv[:, 0].max()) == 2
+
+
 @pytest.mark.errors
 def test_what_cannot_be_read(tmp_path):
     draco = document(extensionsRequired=["KHR_draco_mesh_compression"])
@@ -181,6 +220,9 @@ def test_what_cannot_be_read(tmp_path):
         mesh_file.read(write(tmp_path / "a.gltf", document(buffers=[{"uri": "data:,AAAA", "byteLength": 9}])))
     with pytest.raises(FormatError, match=r"expected a glTF 2\.0 file \(KeyError"):
         mesh_file.read(write(tmp_path / "a.gltf", document(accessors=[{}])))
+    for wild in ({"scale": [1e30, 1]}, {"offset": [0, float("nan")]}):
+        with pytest.raises(FormatError, match="KHR_texture_transform: expected numbers up to 1e"):
+            mesh_file.read(write(tmp_path / "a.gltf", laid(base=wild)))
     circle = [{"mesh": 0, "children": [0]}]
     with pytest.raises(FormatError, match="nodes stand in a circle"):
         mesh_file.read(write(tmp_path / "a.gltf", document(nodes=circle)))

@@ -102,3 +102,16 @@ def test_absurd_shells_are_refused():
     point = replace(body, vertices=torch.zeros_like(body.vertices))
     with pytest.raises(GeometryError, match="shell: expected at least one triangle with an area"):
         shell.build(point, 0.1)
+
+
+def test_a_point_lies_in_the_tetrahedra_around_it(rng):
+    own = shell.build(shapes.torus(triangles=300, tiles=(6, 2)), 0.1)
+    for k in torch.randint(len(own.tets), (30,), generator=rng).tolist():
+        share = torch.rand(4, generator=rng, dtype=torch.float64)
+        share = share / share.sum()
+        point = (share[:, None] * own.vertices[own.tets[k]]).sum(0)
+        tets, place = shell.around(own, point)
+        assert k in tets.tolist()
+        torch.testing.assert_close(place[tets.tolist().index(k)], (share[:, None] * own.uvz[k]).sum(0))
+    assert len(shell.around(own, torch.tensor([9.0, 0, 0]))[0]) == 0
+    assert len(shell.around(own, torch.zeros(3))[0]) == 0

@@ -4,7 +4,7 @@ import torch
 from tests.data import btf_bytes
 from tests.pipeline.small import small
 from torchmeso.compress import rti
-from torchmeso.data import hsh, image, ptm
+from torchmeso.data import eigen_btf, hsh, image, ptm
 from torchmeso.data import rti as rti_files
 from torchmeso.data.rti import LightSet
 from torchmeso.errors import FormatError, human_size
@@ -28,6 +28,14 @@ def test_tables_and_models():
     assert about["MDF data"] == human_size(18 * 16**2)
     # Eight lights, 8 x 8 texels, two terms of rgb in bytes; float32 weights of eight views, scales and offsets.
     assert about["BTF data"] == human_size(8 * 8 * 8 * 2 * 3 + 4 * (8 * 2 + 2 * 2 * 3))
+
+
+def test_models_of_streams(tmp_path):
+    found = bake.open_model(bake.prepare(small()) and bake.model_path(small().materials["brick"]))
+    eigen_btf.save(found.btf, tmp_path / "a.meso", coded=True, psnr=31.4)
+    about = describe.file(tmp_path / "a.meso")
+    assert (about["texels"], about["storage"]) == ("8 x 8", "uint8, adaptive steps, entropy-coded")
+    assert about["PSNR when fitted (dB)"] == 31.4
 
 
 def test_other_files(tmp_path):

@@ -48,7 +48,7 @@ def test_rays_leave_where_the_boundary_is_met_next(rng):
     built = shell.build(shapes.torus(triangles=300, tiles=(6, 2)), 0.2)
     entries, point, normal = rays_into(built, "open", 6000, rng)
     steep = (entries.direction * normal).sum(-1) < -0.05
-    entries = Entries(*(x[steep] for x in entries))
+    entries = Entries(*(x[steep] for x in entries[:4]))
     point = point[steep]
     found = gdm_trace.trace(built, None, entries, floor=False)
     bound = shell.boundary(built, base="open")

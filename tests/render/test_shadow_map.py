@@ -67,8 +67,29 @@ def test_shadow_of_a_ball_is_a_disc_of_the_right_size(name):
 @pytest.mark.parametrize("size", [32, 256])
 def test_a_plane_never_shadows_itself(theta_deg, size):
     theta = math.radians(theta_deg)
-    subject = scene(shapes.plane(size=(4, 4), triangles=200))
+    # Beside and below it a ball at either end, so that the map covers all of it.
+    balls = [moved(shapes.sphere(radius=0.1, triangles=64), x=x, y=-0.2, z=x) for x in (-2.2, 2.2)]
+    subject = scene(shapes.plane(size=(4, 4), triangles=200), *balls)
     assert not blocked(subject, sun(math.sin(theta), math.cos(theta), 0.2), floor_points(1.9), size=size).any()
+
+
+@pytest.mark.parametrize("side", [4, 40, 4000])
+def test_a_wide_floor_takes_no_texels_from_the_shadow_on_it(side):
+    ball = moved(shapes.sphere(radius=0.5, triangles=5000), y=1.0)
+    points = floor_points(1.5)
+    got = blocked(scene(ball, shapes.plane(size=(side, side), tiles=(1, 1))), sun(0, 1, 0), points, size=128)
+    expected = points[:, [0, 2]].norm(dim=-1) < 0.5
+    shared = (got & expected).sum() / (got | expected).sum()
+    assert shared > (0.95 if side < 100 else 0.2)  # the ball is 1/4000 of the last: as fine as float32 allows
+
+
+def test_sheets_shadow_one_another():
+    """Neither has a depth of its own."""
+    awning = moved(shapes.plane(size=(1, 1)), y=1.0)
+    points = floor_points(1.5)
+    got = blocked(scene(shapes.plane(size=(8, 8)), awning), sun(0, 1, 0), points)
+    expected = (points[:, [0, 2]].abs() < 0.5).all(-1)
+    assert (got != expected).float().mean() < 0.02
 
 
 @pytest.mark.parametrize("kind", ["directional", "point", "spot"])
@@ -95,7 +116,7 @@ def test_the_shadow_starts_where_the_ball_touches_the_floor():
     subject = scene(moved(shapes.sphere(radius=0.5, triangles=20_000), y=0.5), shapes.plane(size=(4, 4)))
     light = sun(1, 1, 0)
     x = torch.linspace(-1.2, 1.2, 400)
-    got = blocked(subject, light, torch.stack([x, torch.zeros(400), torch.zeros(400)], -1), size=1024)
+    got = blocked(subject, light, torch.stack([x, torch.zeros(400), torch.zeros(400)], -1), size=384)
     # The ball's shadow on the line z = 0 runs from where the light grazes it to the other side: centre -0.5.
     edges = (-0.5 - 0.5 * math.sqrt(2), -0.5 + 0.5 * math.sqrt(2))
     expected = (x > edges[0]) & (x < edges[1])
@@ -112,8 +133,8 @@ def test_shadow_silhouettes_follow_the_mesostructure():
     radius = points[:, [0, 2]].norm(dim=-1)
     subject = scene(ball, shapes.plane(size=(4, 4)), mdf=sheet)
     light = sun(0.0, 1.0, 0.0)
-    bare = blocked(subject, light, points, silhouette="none", size=512)
-    carved = blocked(subject, light, points, silhouette="curved", size=512)
+    bare = blocked(subject, light, points, silhouette="none", size=128)
+    carved = blocked(subject, light, points, silhouette="curved", size=128)
     assert float(radius[bare].max()) == pytest.approx(0.5, abs=0.02)
     assert float(radius[carved].max()) < 0.5 - 0.5 * 0.2 * scale
     assert (bare | ~carved).all()

@@ -293,6 +293,7 @@ MEASUREMENTS = (
     Measurement("compress.rate", rate),
     Measurement("compress.sh_pca", sh_pca.rows),
     Measurement("compress.budget", rates.budgets),
+    Measurement("compress.adaptive", rates.adaptive),
     Measurement("compress.decode", rates.decoding),
     Measurement("compress.sh", harmonics.basis),
     Measurement("compress.rotation", harmonics.rotation),

@@ -1,15 +1,17 @@
 """Error over size at 10:1, 50:1 and 200:1 of eight-bit pictures, on baked materials, for every representation.
 
 Sizes are those of the files: eight bits of double SH and eigen maps, halves of the factors of one decomposition per
-channel (what Bonn's `.btf` files hold), streams and bases of the transform code. PSNR is that of all values, linear,
-the 99.5th percentile as peak; FLIP the mean of pictures spread over lights and views.
+channel (what Bonn's `.btf` files hold), streams and bases of the transform code and of adaptive steps. PSNR is that of
+all values, linear, the 99.5th percentile as peak; FLIP the mean of pictures spread over lights and views.
 
 Test: tests/bench/test_rate.py
 """
 
 import math
+import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import torch
 from jaxtyping import Float
@@ -20,13 +22,17 @@ from torchmeso.algebra.spherical_harmonics import basis, degree_of
 from torchmeso.bench import frames
 from torchmeso.bench.suite import Context, Row
 from torchmeso.bench.timing import time_together
-from torchmeso.compress import dfmf, double_sh, eigen, transform
+from torchmeso.compress import budget, dfmf, double_sh, double_sh_budget, eigen, eigen_budget, transform
+from torchmeso.compress.budget import Budget
 from torchmeso.compress.dfmf import DfmfOptions
 from torchmeso.compress.double_sh import DoubleShOptions
+from torchmeso.compress.eigen import EigenOptions
 from torchmeso.compress.transform import TransformOptions
-from torchmeso.data import btfdbb_colour
+from torchmeso.data import btfdbb_colour, eigen_btf, sh_btf
 from torchmeso.data.btf import Btf
 from torchmeso.data.btfdbb_colour import Colour
+from torchmeso.data.eigen_btf import EigenBtf
+from torchmeso.data.sh_btf import ShBtf
 from torchmeso.meso import bake_btf, generators
 from torchmeso.meso.bake_btf import BtfOptions
 from torchmeso.render.renderer import Renderer
@@ -41,10 +47,7 @@ MATERIALS = ("brick", "weave", "squama")
 def budgets(context: Context) -> Iterator[Row]:
     """Each representation at each size, on one material (quick) or all."""
     for name in MATERIALS[:1] if context.quick else MATERIALS:
-        options = BtfOptions(texels=32, lights="ubo81", views="ubo81", samples=1, bounces=0)
-        table = bake_btf.in_memory(getattr(generators, name)(), options)
-        T = table.pictures().float()
-        yield from _at_all_sizes(name, Btf(images=T, lights=table.lights, views=table.views), T)
+        yield from _at_all_sizes(name, *_baked(name))
 
 
 def _at_all_sizes(name: str, table: Btf, T: Tensor) -> Iterator[Row]:
@@ -52,7 +55,7 @@ def _at_all_sizes(name: str, table: Btf, T: Tensor) -> Iterator[Row]:
         room = T.numel() // ratio
         found: dict[str, float] = {}
         for method, shown, size in _models(table, T, room, ratio):
-            found[method] = transform.psnr_of(T, shown)
+            found[method] = budget.psnr_of(T, shown)
             goal, why = None, ""
             if method == "transform" and ratio == 10:
                 goal, why = found["double-sh"] + 3, "; goal: double SH + 3 dB"
@@ -81,20 +84,15 @@ def _models(
         model = double_sh.fit(
             table, DoubleShOptions(light_terms=light_terms, view_terms=view_terms, energy=energy), backend="auto"
         )
-        y = [
-            basis(side.directions(), degree_of(n)).float()
-            for side, n in ((table.lights, light_terms), (table.views, view_terms))
-        ]
-        tries.append(torch.einsum("li,vj,ijhwc->lvhwc", *y, model.decoded()))
+        tries.append(_shown_harmonics(model))
     yield (
         "double-sh",
-        max(tries, key=lambda shown: transform.psnr_of(T, shown)),
+        max(tries, key=lambda shown: budget.psnr_of(T, shown)),
         light_terms * view_terms * height * width * 3,
     )
     rank = max(1, min(n_view, room // (n_light * height * width * 3)))
-    eigen_btf = eigen.fit(table, eigen.EigenOptions(rank=rank))
-    shown = torch.einsum("lhwkc,vk->lvhwc", eigen_btf.decoded(), eigen_btf.weights)
-    yield "eigen", shown, eigen_btf.maps.numel() + 4 * eigen_btf.weights.numel()
+    model = eigen.fit(table, EigenOptions(rank=rank))
+    yield "eigen", _shown_eigen(model), model.maps.numel() + 4 * model.weights.numel()
     per_component = 2 * 3 * (n_light * n_view + height * width)
     rank = max(1, min(height * width, room // per_component))
     for method, colour in (("svd", Colour(0)), ("dfmf", Colour(11))):
@@ -103,10 +101,67 @@ def _models(
         x = torch.stack([U @ V.mT for U, V in factors], -1).unflatten(1, (height, width)).flip(1)
         shown = btfdbb_colour.to_rgb(colour, x).unflatten(0, (n_view, n_light)).transpose(0, 1)
         yield method, shown.float(), rank * per_component
+    coded, _ = eigen_budget.fit(table, Budget(size=room), storage="adaptive")
+    yield "eigen-adaptive", _shown_eigen(coded), eigen_budget.file_size(coded)
+    most = DoubleShOptions(light_terms=36, view_terms=36, energy=10.0, storage="adaptive")
+    harmonic, _ = double_sh_budget.fit(table, Budget(size=room), most, backend="auto")
+    yield "double-sh-adaptive", _shown_harmonics(harmonic), double_sh_budget.file_size(harmonic, coded=True)
     packed, _ = transform.fit(table, TransformOptions(size=room))
-    opened = packed.expanded()
-    shown = torch.einsum("lhwkc,vk->lvhwc", opened.decoded(), opened.weights)
-    yield "transform", shown, transform.size(packed)
+    yield "transform", _shown_eigen(packed.expanded()), transform.size(packed)
+
+
+def adaptive(context: Context) -> Iterator[Row]:
+    """Files of adaptive steps beside those of eight bits for all, at the same error: written, opened and held."""
+    jobs: dict[str, EigenOptions | DoubleShOptions] = {
+        "eigen.4": EigenOptions(rank=4),
+        "eigen.16": EigenOptions(rank=16),
+        "double-sh.81": DoubleShOptions(light_terms=9, view_terms=9),
+        "double-sh.625": DoubleShOptions(),
+    }
+    for name in MATERIALS[:1] if context.quick else MATERIALS:
+        table, T = _baked(name)
+        for method, options in jobs.items():
+            eight, eight_db = _written(table, T, options, coded=False)
+            coded, _ = _written(table, T, options, coded=True)
+            ours, ours_db = _written(table, T, replace(options, storage="adaptive"), coded=True)
+            yield Row(
+                id=f"compress.adaptive.{name}.{method}",
+                what=f"bytes of a file of eight bits over those of adaptive steps, baked {name}, {method}",
+                value=round(eight / ours, 2), unit="x", better="higher", goal=2.0,
+                peer=f"{eight_db:.2f} dB and {ours_db:.2f} dB; {coded / ours:.2f} x where both are entropy-coded",
+            )  # fmt: skip
+
+
+def _baked(name: str) -> tuple[Btf, Tensor]:
+    options = BtfOptions(texels=32, lights="ubo81", views="ubo81", samples=1, bounces=0)
+    table = bake_btf.in_memory(getattr(generators, name)(), options)
+    T = table.pictures().float()
+    return Btf(images=T, lights=table.lights, views=table.views), T
+
+
+def _written(table: Btf, T: Tensor, options: EigenOptions | DoubleShOptions, *, coded: bool) -> tuple[int, float]:
+    """Return the bytes of the file of a fit, and the PSNR of what is read from it."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "a.meso"
+        if isinstance(options, EigenOptions):
+            eigen_btf.save(eigen.fit(table, options), path, coded=coded)
+            shown = _shown_eigen(eigen_btf.load(path))
+        else:
+            sh_btf.save(double_sh.fit(table, options, backend="auto"), path, coded=coded)
+            shown = _shown_harmonics(sh_btf.load(path))
+        return path.stat().st_size, budget.psnr_of(T, shown)
+
+
+def _shown_eigen(model: EigenBtf) -> Float[Tensor, "light view H W 3"]:
+    return torch.einsum("lhwkc,vk->lvhwc", model.decoded(), model.weights)
+
+
+def _shown_harmonics(model: ShBtf) -> Float[Tensor, "light view H W 3"]:
+    y = [
+        basis(side.directions(), degree_of(n)).float()
+        for side, n in zip((model.lights, model.views), model.terms, strict=True)
+    ]
+    return torch.einsum("li,vj,ijhwc->lvhwc", *y, model.decoded())
 
 
 def decoding(context: Context) -> Iterator[Row]:
@@ -120,7 +175,7 @@ def decoding(context: Context) -> Iterator[Row]:
     size = 3600 * 3 * texels * texels // 50
     models = {
         "double-sh": double_sh.fit(table, DoubleShOptions(), backend="auto"),
-        "eigen4": eigen.fit(table, eigen.EigenOptions(rank=4)),
+        "eigen4": eigen.fit(table, EigenOptions(rank=4)),
         **{
             f"transform{rank}": transform.fit(table, TransformOptions(size=size, rank=rank))[0].expanded()
             for rank in (4, 16, 60)

@@ -30,7 +30,8 @@ from torchmeso.algebra import secular
 from torchmeso.algebra.secular import Factors
 from torchmeso.algebra.spherical_harmonics import basis, degree_of
 from torchmeso.backends import BackendChoice, opencl
-from torchmeso.compress.quantize import Storage, quantize
+from torchmeso.compress import quantize
+from torchmeso.compress.quantize import Storage
 from torchmeso.data import bands, image
 from torchmeso.data.btf import Bands
 from torchmeso.data.sh_btf import ShBtf
@@ -49,6 +50,9 @@ LANES, GROUPS = 16, 4
 LIT_SHARE = 0.9
 """Share of columns up to which those that are not black are copied out first."""
 
+ROWS = 4
+"""Rows of texels that are read again to tell what the harmonics leave out."""
+
 Progress = Callable[[float], None]
 
 
@@ -60,7 +64,7 @@ class DoubleShOptions:
         light_terms: k_l: 1, 4, 9, 16, 25 or 36.
         view_terms: k_v.
         energy: bound of the coefficients' energy, of the energy that the samples show; None = plain least squares.
-        storage: uint8, float16 or float32.
+        storage: uint8, float16, float32, or adaptive (bytes with steps that follow their variance).
         regularise: let directions that cannot tell the coefficients apart pass, with the smallest coefficients.
     """
 
@@ -141,13 +145,43 @@ def fit(
     """
     options = options or DoubleShOptions()
     light, view = sides(btf, options)
+    found = whole(btf, light, view, backend=backend, progress=lambda share: progress(0.9 * share))
+    model = model_of(btf, light, view, found, options.storage)
+    progress(1.0)
+    return model
+
+
+def whole(
+    btf: Bands,
+    light: Side,
+    view: Side,
+    *,
+    backend: BackendChoice = "torch",
+    progress: Progress = lambda share: None,
+) -> Float[Tensor, "k H W 3"]:
+    """Return the coefficients of the whole texture, k = (0,0), (0,1), ..., in float16; raises as `coefficients`."""
     height, width = btf.texels
     found = torch.empty(light.terms * view.terms, height, width * 3, dtype=torch.float16)
     for rows, c in coefficients(btf, light, view, bands.layout(btf), backend=backend):
         found[:, rows] = c
-        progress(0.9 * rows.stop / height)
-    maps, scale, offset = quantised(found.unflatten(2, (width, 3)), options.storage)
-    progress(1.0)
+        progress(rows.stop / height)
+    return found.unflatten(2, (width, 3))
+
+
+def model_of(
+    btf: Bands,
+    light: Side,
+    view: Side,
+    found: Float[Tensor, "k H W 3"],
+    storage: Storage,
+    share: float = quantize.SHARE,
+) -> ShBtf:
+    """Return the model of coefficients; of adaptive steps `share` is what they may add to the squared error."""
+    step = None
+    if storage == "adaptive":
+        lost = left_out(btf, light, view, lambda row: found[:, row].flatten(1))
+        step = quantize.steps([quantize.spread(c) for c in found], gain(light, view), lost, share)
+    maps, scale, offset = quantised(found, storage, step)
     terms = light.terms, view.terms
     return ShBtf(
         maps=maps.unflatten(0, terms), scale=scale.unflatten(0, terms), offset=offset.unflatten(0, terms),
@@ -309,8 +343,36 @@ def _in_half(c: Float[Tensor, "k column"], where: str) -> Float[Tensor, "k colum
     return half
 
 
-def quantised(found: Float[Tensor, "k H W 3"], storage: Storage) -> tuple[Tensor, Tensor, Tensor]:
+def quantised(
+    found: Float[Tensor, "k H W 3"], storage: Storage, step: Float[Tensor, "k 3"] | None = None
+) -> tuple[Tensor, Tensor, Tensor]:
     """Return codes, scale and offset of every coefficient and channel."""
-    parts = [quantize(c.float()[..., None, :], storage) for c in found]
+    parts = [
+        quantize.quantize(c.float()[..., None, :], storage, None if step is None else step[k, None])
+        for k, c in enumerate(found)
+    ]
     codes, scale, offset = (torch.stack(x).squeeze(-2) for x in zip(*parts, strict=True))
     return codes, scale, offset
+
+
+def gain(light: Side, view: Side) -> Float[Tensor, "k"]:
+    """Return the mean squared T of coefficients of 1, (0,0), (0,1), ..., over all pairs of directions."""
+    over_light, over_view = (side.factors.matrix.square().mean(0) for side in (light, view))
+    return (over_light[:, None] * over_view).flatten()
+
+
+def left_out(btf: Bands, light: Side, view: Side, coefficients: Callable[[int], Float[Tensor, "k column"]]) -> float:
+    """Return the mean squared error of T, before quantisation, in `ROWS` rows of texels spread over the texture.
+
+    `coefficients` is called with a row.
+    """
+    height = btf.texels[0]
+    rows = sorted({(2 * n + 1) * height // (2 * ROWS) for n in range(ROWS)})
+    Y_light, Y_view = (side.factors.matrix.float() for side in (light, view))
+    total = 0.0
+    for row in rows:
+        T = btf.rows(row, row + 1)
+        c = coefficients(row).float().unflatten(0, (light.terms, view.terms))
+        shown = torch.einsum("li,vj,ijx->lvx", Y_light, Y_view, c)
+        total += float((shown - T.flatten(2)).square().mean(dtype=torch.float64))
+    return total / len(rows)

@@ -7,7 +7,7 @@ E = A W: the whole BTF is never in memory.
 Test: tests/compress/test_eigen.py
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -15,7 +15,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchmeso.algebra.gram import gram, right_basis
-from torchmeso.compress.quantize import Storage, quantize
+from torchmeso.compress import quantize
+from torchmeso.compress.quantize import Spread, Storage
 from torchmeso.data import bands
 from torchmeso.data.btf import Bands
 from torchmeso.data.eigen_btf import EigenBtf
@@ -30,7 +31,7 @@ class EigenOptions:
 
     Attributes:
         rank: components kept (4 in wang2005mdf), at most the number of views.
-        storage: uint8, float16 or float32.
+        storage: uint8, float16, float32, or adaptive (bytes with steps that follow their variance).
     """
 
     rank: int = 4
@@ -51,22 +52,50 @@ def fit(btf: Bands, options: EigenOptions | None = None, *, progress: Progress =
     """
     options = options or EigenOptions()
     check(btf, options)
-    n_view = len(btf.views)
-    height, width = btf.texels
-    layout = bands.layout(btf)
-    total = torch.zeros(n_view, n_view, dtype=torch.float64)
-    for rows, sum_so_far in grams(btf, layout, total):
-        total = sum_so_far
-        progress(0.5 * rows.stop / height)
+    total = gram_over_views(btf, lambda share: progress(0.5 * share))
     W = right_basis(total, options.rank).vectors.float()
-    maps = torch.empty(len(btf.lights), height, width, options.rank, 3)
-    for rows, E in scores(btf, W, layout):
-        maps[:, rows] = E.permute(1, 2, 3, 0, 4)
-        progress(0.5 + 0.5 * rows.stop / height)
-    codes = quantize(maps, options.storage)
+    maps = maps_of(btf, W, lambda share: progress(0.5 + 0.5 * share))
+    step = None
+    if options.storage == "adaptive":
+        spreads = (quantize.spread(maps[..., k, :]) for k in range(options.rank))
+        step = adaptive_steps(btf, options.rank, total, spreads)
+    codes = quantize.quantize(maps, options.storage, step)
     return EigenBtf(
         maps=codes.codes, weights=W, scale=codes.scale, offset=codes.offset, lights=btf.lights, views=btf.views
     )
+
+
+def gram_over_views(btf: Bands, progress: Progress = lambda share: None) -> Float[Tensor, "view view"]:
+    """Return the sum over all rows of the matrix, in float64."""
+    n_view = len(btf.views)
+    total = torch.zeros(n_view, n_view, dtype=torch.float64)
+    for rows, sum_so_far in grams(btf, bands.layout(btf), total):
+        total = sum_so_far
+        progress(rows.stop / btf.texels[0])
+    return total
+
+
+def maps_of(
+    btf: Bands, W: Float[Tensor, "view rank"], progress: Progress = lambda share: None
+) -> Float[Tensor, "light H W rank 3"]:
+    """Return the eigen maps E = A W of the whole texture."""
+    height, width = btf.texels
+    maps = torch.empty(len(btf.lights), height, width, W.shape[1], 3)
+    for rows, E in scores(btf, W, bands.layout(btf)):
+        maps[:, rows] = E.permute(1, 2, 3, 0, 4)
+        progress(rows.stop / height)
+    return maps
+
+
+def adaptive_steps(
+    btf: Bands, rank: int, total: Float[Tensor, "view view"], spreads: Iterable[Spread]
+) -> Float[Tensor, "rank 3"]:
+    """Return the steps of eigen maps: weights over views are orthonormal, so that all maps have the same gain."""
+    height, width = btf.texels
+    values = len(btf.lights) * len(btf.views) * height * width * 3
+    left_out = torch.linalg.eigvalsh(total)[: len(btf.views) - rank].clamp(min=0).sum()
+    gain = torch.full((rank,), 1 / len(btf.views))
+    return quantize.steps(list(spreads), gain, float(left_out) / values)
 
 
 def check(btf: Bands, options: EigenOptions) -> None:

@@ -76,6 +76,8 @@ class ShPcaOptions:
                 f"compress.rank: expected 1 to {3 * self.light_terms} (three channels of {self.light_terms} "
                 f"coefficients), got {self.rank}"
             )
+        if self.storage == "adaptive":
+            raise ConfigError("compress.storage: SH + PCA has no adaptive steps; take uint8, float16 or float32")
         check_range("compress.ridge", self.ridge, 0, 1e6)
         if self.training is not None:
             check_range("compress.training", self.training, self.rank, 1e9)

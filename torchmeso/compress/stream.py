@@ -3,7 +3,8 @@
 Bands of texel rows are fitted as in `compress.double_sh` and `compress.eigen`, and kept in a journal beside the model
 (`data.journal`); a model needs the range of each of its maps before the first code can be written. Then one map after
 the other is collected over the bands, quantised and written. The file holds what `fit` and `save` would give, bit for
-bit. SH + PCA reads in bands too, but keeps its weights in memory and begins anew.
+bit. SH + PCA reads in bands too, but keeps its weights in memory and begins anew. Adaptive steps need the spread
+of all maps first: these are then collected twice, and the streams are in memory until the last one is there.
 
 Test: tests/compress/test_stream.py
 """
@@ -17,10 +18,9 @@ from torch import Tensor
 
 from torchmeso.algebra.gram import right_basis
 from torchmeso.backends import BackendChoice
-from torchmeso.compress import double_sh, eigen, sh_pca
+from torchmeso.compress import double_sh, eigen, quantize, sh_pca
 from torchmeso.compress.double_sh import DoubleShOptions, quantised
 from torchmeso.compress.eigen import EigenOptions
-from torchmeso.compress.quantize import quantize
 from torchmeso.compress.sh_pca import ShPcaOptions
 from torchmeso.data import bands, eigen_btf, journal, sh_btf, sh_pca_btf, store
 from torchmeso.data.btf import Bands
@@ -96,18 +96,35 @@ def _fit_double_sh(
         kept.write(_name("c", rows), c)
         progress(0.8 * rows.stop / height)
 
-    def coefficients(i: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Return codes, scale and offset of all coefficients (i, 0), (i, 1), ..."""
+    def collected(i: int) -> Tensor:
+        """Return all coefficients (i, 0), (i, 1), ..."""
         found = torch.empty(view.terms, height, width, 3, dtype=torch.float16)
         for rows in layout:
             part = kept.read(_name("c", rows), shape(rows), torch.float16, first=i * view.terms, count=view.terms)
             found[:, rows] = part.unflatten(2, (width, 3))
+        return found
+
+    def of_row(row: int) -> Tensor:
+        """Return all coefficients of a row of texels."""
+        rows = next(rows for rows in layout if row < rows.stop)
+        return kept.read(_name("c", rows), shape(rows), torch.float16)[:, row - rows.start]
+
+    step = None
+    if options.storage == "adaptive":
+        spreads = [quantize.spread(c) for i in range(light.terms) for c in collected(i)]
+        lost = double_sh.left_out(btf, light, view, of_row)
+        step = quantize.steps(spreads, double_sh.gain(light, view), lost).unflatten(0, (light.terms, view.terms))
+
+    def coefficients(i: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Return codes, scale and offset of all coefficients (i, 0), (i, 1), ..."""
+        found = quantised(collected(i), options.storage, None if step is None else step[i])
         progress(0.8 + 0.2 * (i + 1) / light.terms)
-        return quantised(found, options.storage)
+        return found
 
     sh_btf.write(
         path, coefficients, terms=(light.terms, view.terms), texels=(height, width),
-        dtype=getattr(torch, options.storage), lights=btf.lights, views=btf.views, silhouette=silhouette,
+        dtype=quantize.dtype_of(options.storage), lights=btf.lights, views=btf.views, silhouette=silhouette,
+        coded=options.storage == "adaptive",
     )  # fmt: skip
 
 
@@ -141,18 +158,28 @@ def _fit_eigen(
         kept.write(_name("E", rows), E)
         progress(0.4 + 0.4 * rows.stop / height)
 
-    def component(k: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Return codes, scale and offset of one eigen map."""
+    def collected(k: int) -> Tensor:
+        """Return one eigen map."""
         found = torch.empty(n_light, height, width, 3)
         for rows in layout:
             found[:, rows] = kept.read(_name("E", rows), shape(rows), torch.float32, first=k, count=1)[0]
-        codes = quantize(found[..., None, :], options.storage)
+        return found
+
+    step = None
+    if options.storage == "adaptive":
+        spreads = (quantize.spread(collected(k)) for k in range(options.rank))
+        step = eigen.adaptive_steps(btf, options.rank, total, spreads)
+
+    def component(k: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Return codes, scale and offset of one eigen map."""
+        found = collected(k)[..., None, :]
+        codes = quantize.quantize(found, options.storage, None if step is None else step[k, None])
         progress(0.8 + 0.2 * (k + 1) / options.rank)
         return codes.codes[..., 0, :], codes.scale[0], codes.offset[0]
 
     eigen_btf.write(
-        path, component, weights=W, texels=(height, width), dtype=getattr(torch, options.storage),
-        lights=btf.lights, views=btf.views, silhouette=silhouette,
+        path, component, weights=W, texels=(height, width), dtype=quantize.dtype_of(options.storage),
+        lights=btf.lights, views=btf.views, silhouette=silhouette, coded=options.storage == "adaptive",
     )  # fmt: skip
 
 

@@ -4,7 +4,7 @@ wang2005mdf, section 5: the BTF as a matrix with rows (x, y, light, rgb) and col
 vectors. E_k are maps over lights and texels (the eigen maps), W_k weights over views; one W serves all three
 channels. Maps are stored as uint8 with a scale and an offset per component and channel, or as float16 or
 float32. Interpolation is linear, so it runs on the codes and decodes once. Weights have no texels: they are
-interpolated on a finer set (`geometry.kriging`).
+interpolated on a finer set (`geometry.kriging`). In a file uint8 codes may be streams (`data.code_stream`).
 
 Test: tests/data/test_eigen_btf.py
 """
@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor
 
-from torchmeso.data import address, mdf, model_writer, pyramid, store
+from torchmeso.data import address, code_stream, mdf, model_writer, pyramid, store
 from torchmeso.data.btf import horizon_falloff
 from torchmeso.data.mdf import Mdf
 from torchmeso.data.pyramid import Footprint
@@ -184,11 +184,19 @@ def _decode(codes: Tensor, scale: Tensor, offset: Tensor) -> Tensor:
     return offset + scale * codes.to(scale.dtype)
 
 
-def save(eigen: EigenBtf, path: str | Path, *, silhouette: Mdf | None = None, **meta: object) -> None:
-    """Write a run-time model (.meso): one tensor per component, and the material's MDF where it has one."""
-    tensors = {f"eigen.map.{k}": eigen.maps[..., k, :] for k in range(eigen.rank)}
+def save(
+    eigen: EigenBtf, path: str | Path, *, silhouette: Mdf | None = None, coded: bool = False, **meta: object
+) -> None:
+    """Write a run-time model (.meso): one tensor per component, and the material's MDF where it has one.
+
+    Where it is `coded`, components of uint8 codes are streams, and those whose codes are all 0 are not stored.
+    """
+    tensors: dict[str, Tensor] = {}
+    for k in range(eigen.rank):
+        codes = eigen.maps[..., k, :]
+        tensors |= _stream(k, codes) if coded else {f"eigen.map.{k}": codes}
     tensors |= {"eigen.weights": eigen.weights, "eigen.scale": eigen.scale, "eigen.offset": eigen.offset}
-    parts = _meta(eigen.lights, eigen.views, eigen.rank, meta)
+    parts = _meta(eigen.lights, eigen.views, eigen.rank, eigen.texels if coded else None, meta)
     if silhouette is not None:
         mdf_tensors, parts["mdf"] = mdf.to_tensors(silhouette)
         tensors |= mdf_tensors
@@ -205,6 +213,7 @@ def write(
     lights: DirectionSet,
     views: DirectionSet,
     silhouette: Mdf | None = None,
+    coded: bool = False,
 ) -> None:
     """Write a run-time model (.meso) as `save` does, one component at a time.
 
@@ -217,20 +226,30 @@ def write(
         lights: directions towards the light.
         views: directions towards the viewer.
         silhouette: the material's MDF.
+        coded: whether codes are streams, which are kept in memory until all are there.
 
     Raises:
         StorageError: the disk is full, or the place cannot be written to.
     """
     rank = weights.shape[1]
+    depth: dict[str, Tensor] = {}
+    parts = _meta(lights, views, rank, texels if coded else None, {})
+    if silhouette is not None:
+        depth, parts["mdf"] = mdf.to_tensors(silhouette)
+    if coded:
+        streams: dict[str, Tensor] = {}
+        scales, offsets = torch.empty(rank, 3), torch.empty(rank, 3)
+        for k in range(rank):
+            codes, scales[k], offsets[k] = component(k)
+            streams |= _stream(k, codes)
+        tensors = {"eigen.weights": weights, "eigen.scale": scales, "eigen.offset": offsets}
+        store.write_model(path, {**streams, **tensors, **depth}, parts)
+        return
     layout: dict[str, tuple[torch.dtype, tuple[int, ...]]] = {
         f"eigen.map.{k}": (dtype, (len(lights), *texels, 3)) for k in range(rank)
     }
     layout |= dict.fromkeys(("eigen.scale", "eigen.offset"), (torch.float32, (rank, 3)))
-    whole = {"eigen.weights": weights}
-    parts = _meta(lights, views, rank, {})
-    if silhouette is not None:
-        mdf_tensors, parts["mdf"] = mdf.to_tensors(silhouette)
-        whole |= mdf_tensors
+    whole = {"eigen.weights": weights, **depth}
     layout |= {name: (x.dtype, tuple(x.shape)) for name, x in whole.items()}
     with model_writer.in_parts(path, layout, parts) as put:
         for k in range(rank):
@@ -242,8 +261,18 @@ def write(
             put(name, x, 0)
 
 
-def _meta(lights: DirectionSet, views: DirectionSet, rank: int, more: dict[str, object]) -> dict:
-    return {"kind": "eigen", "eigen": {"lights": lights.name, "views": views.name, "rank": rank}, **more}
+def _stream(k: int, codes: Tensor) -> dict[str, Tensor]:
+    return code_stream.named(f"eigen.code.{k}", codes, first=k == 0)
+
+
+def _meta(
+    lights: DirectionSet, views: DirectionSet, rank: int, coded: tuple[int, int] | None, more: dict[str, object]
+) -> dict:
+    """Return what the file says about itself; of streams it has to say the texels."""
+    about: dict[str, object] = {"lights": lights.name, "views": views.name, "rank": rank}
+    if coded is not None:
+        about["texels"] = list(coded)
+    return {"kind": "eigen", "eigen": about, **more}
 
 
 def load(path: str | Path, *, rank: int | None = None) -> EigenBtf:
@@ -260,11 +289,18 @@ def load(path: str | Path, *, rank: int | None = None) -> EigenBtf:
         kept = about["rank"] if rank is None else min(rank, about["rank"])
         if kept < 1:
             raise FormatError(f"{path}: expected at least one component, got {kept}; the copy may be incomplete")
+        lights, scale = hemisphere.parse(about["lights"]), model.read("eigen.scale")
+        check_shape("eigen.scale", scale, (about["rank"], 3))
+        if "texels" in about:
+            shape = len(lights), *about["texels"], 3
+            maps = [code_stream.read(model, f"eigen.code.{k}", shape, first=k == 0) for k in range(kept)]
+        else:
+            maps = [model.read(f"eigen.map.{k}") for k in range(kept)]
         return EigenBtf(
-            maps=torch.stack([model.read(f"eigen.map.{k}") for k in range(kept)], -2),
+            maps=torch.stack(maps, -2),
             weights=model.read("eigen.weights")[:, :kept],
-            scale=model.read("eigen.scale")[:kept],
+            scale=scale[:kept],
             offset=model.read("eigen.offset")[:kept],
-            lights=hemisphere.parse(about["lights"]),
+            lights=lights,
             views=hemisphere.parse(about["views"]),
         )

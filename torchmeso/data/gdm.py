@@ -34,10 +34,13 @@ class Query(NamedTuple):
     Attributes:
         distance: (...) way to the material, or to where the table ends for a ray that meets none.
         left: (...) whether it meets none until there.
+        near: (...) way to the material that the samples which meet some tell of, fewer than half of them where `left`;
+            inf where none does.
     """
 
     distance: Float[Tensor, "*batch"]
     left: Bool[Tensor, "*batch"]
+    near: Float[Tensor, "*batch"]
 
 
 class Matter(NamedTuple):
@@ -136,8 +139,9 @@ class Gdm:
         hits = hits + blocks
         end = self.boundary(place, w)
         left = ~inside & (misses >= hits)
-        distance = torch.where(left, end, torch.minimum(distance.clamp(min=0), end))
-        return Query(torch.where(inside, 0, distance), left)
+        near = torch.minimum(distance.clamp(min=0), end)
+        distance = torch.where(inside, 0, torch.where(left, end, near))
+        return Query(distance, left, torch.where(hits > 1e-6, near, torch.inf))
 
     def boundary(self, place: Float[Tensor, "*batch 3"], w: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         """Return the way along `w` to the top or bottom of the slab, at most `cap`."""

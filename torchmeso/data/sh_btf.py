@@ -2,7 +2,8 @@
 
 leung2007tileable, section 3.1: every texel and channel holds a matrix of k_l x k_v coefficients of real spherical
 harmonics (`algebra.spherical_harmonics`), stored as uint8 with a scale and an offset per coefficient and channel, or
-as float16 or float32. Interpolation is linear, so it runs on the codes.
+as float16 or float32. Interpolation is linear, so it runs on the codes. In a file uint8 codes may be streams
+(`data.code_stream`).
 
 The coefficients describe the measured part of the hemisphere. Beyond the last ring of directions T is the ring's
 value, times cos(theta_i) / cos(last) along the light: as for every BTF of this package, and C0 at the horizon, which
@@ -22,7 +23,7 @@ from jaxtyping import Float, Shaped
 from torch import Tensor
 
 from torchmeso.algebra.spherical_harmonics import basis, degree_of
-from torchmeso.data import address, mdf, model_writer, pyramid, store
+from torchmeso.data import address, code_stream, mdf, model_writer, pyramid, store
 from torchmeso.data.btf import horizon_falloff
 from torchmeso.data.mdf import Mdf
 from torchmeso.data.pyramid import Footprint
@@ -196,15 +197,22 @@ def bands(terms: int) -> list[slice]:
     return [slice(l * l, (l + 1) ** 2) for l in range(degree_of(terms) + 1)]
 
 
-def save(model: ShBtf, path: str | Path, *, silhouette: Mdf | None = None, **meta: object) -> None:
-    """Write a run-time model (.meso): one tensor per band of light and view, and the material's MDF if it has one."""
-    tensors = {
-        f"sh.map.{a}.{b}": model.maps[light, view]
-        for a, light in enumerate(bands(model.terms[0]))
-        for b, view in enumerate(bands(model.terms[1]))
-    }
+def save(model: ShBtf, path: str | Path, *, silhouette: Mdf | None = None, coded: bool = False, **meta: object) -> None:
+    """Write a run-time model (.meso): one tensor per band of light and view, and the material's MDF if it has one.
+
+    Where it is `coded`, the bands of the view of each coefficient of the light are streams of uint8 codes, and those
+    whose codes are all 0 are not stored.
+    """
+    tensors: dict[str, Tensor] = {}
+    if coded:
+        for i in range(model.terms[0]):
+            tensors |= _streams(i, model.maps[i])
+    else:
+        for a, light in enumerate(bands(model.terms[0])):
+            for b, view in enumerate(bands(model.terms[1])):
+                tensors[f"sh.map.{a}.{b}"] = model.maps[light, view]
     tensors |= {"sh.scale": model.scale, "sh.offset": model.offset}
-    parts = _meta(model.lights, model.views, model.terms, meta)
+    parts = _meta(model.lights, model.views, model.terms, model.texels if coded else None, meta)
     if silhouette is not None:
         mdf_tensors, parts["mdf"] = mdf.to_tensors(silhouette)
         tensors |= mdf_tensors
@@ -221,6 +229,7 @@ def write(
     lights: DirectionSet,
     views: DirectionSet,
     silhouette: Mdf | None = None,
+    coded: bool = False,
 ) -> None:
     """Write a run-time model (.meso) as `save` does, one coefficient of the light at a time.
 
@@ -233,21 +242,30 @@ def write(
         lights: directions towards the light.
         views: directions towards the viewer.
         silhouette: the material's MDF.
+        coded: whether codes are streams, which are kept in memory until all are there.
 
     Raises:
         StorageError: the disk is full, or the place cannot be written to.
     """
+    parts = _meta(lights, views, terms, texels if coded else None, {})
+    depth: dict[str, Tensor] = {}
+    if silhouette is not None:
+        depth, parts["mdf"] = mdf.to_tensors(silhouette)
+    if coded:
+        streams: dict[str, Tensor] = {}
+        scales, offsets = torch.empty(*terms, 3), torch.empty(*terms, 3)
+        for i in range(terms[0]):
+            codes, scales[i], offsets[i] = coefficients(i)
+            streams |= _streams(i, codes)
+        store.write_model(path, {**streams, "sh.scale": scales, "sh.offset": offsets, **depth}, parts)
+        return
     layout: dict[str, tuple[torch.dtype, tuple[int, ...]]] = {
         f"sh.map.{a}.{b}": (dtype, (2 * a + 1, 2 * b + 1, *texels, 3))
         for a in range(len(bands(terms[0])))
         for b in range(len(bands(terms[1])))
     }
     layout |= dict.fromkeys(("sh.scale", "sh.offset"), (torch.float32, (*terms, 3)))
-    parts = _meta(lights, views, terms, {})
-    depth: dict[str, Tensor] = {}
-    if silhouette is not None:
-        depth, parts["mdf"] = mdf.to_tensors(silhouette)
-        layout |= {name: (x.dtype, tuple(x.shape)) for name, x in depth.items()}
+    layout |= {name: (x.dtype, tuple(x.shape)) for name, x in depth.items()}
     with model_writer.in_parts(path, layout, parts) as put:
         for a, light in enumerate(bands(terms[0])):
             for i in range(light.start, light.stop):
@@ -260,8 +278,25 @@ def write(
             put(name, x, 0)
 
 
-def _meta(lights: DirectionSet, views: DirectionSet, terms: tuple[int, int], more: dict[str, object]) -> dict:
+def _streams(i: int, codes: Tensor) -> dict[str, Tensor]:
+    """Return the streams of coefficient i of the light, one for each band of the view."""
+    found: dict[str, Tensor] = {}
+    for b, view in enumerate(bands(len(codes))):
+        found |= code_stream.named(f"sh.code.{i}.{b}", codes[view], first=i == b == 0)
+    return found
+
+
+def _meta(
+    lights: DirectionSet,
+    views: DirectionSet,
+    terms: tuple[int, int],
+    coded: tuple[int, int] | None,
+    more: dict[str, object],
+) -> dict:
+    """Return what the file says about itself; of streams it has to say the texels."""
     about = {"lights": lights.name, "views": views.name, "terms": list(terms), "domain": "hemisphere_fit"}
+    if coded is not None:
+        about["texels"] = list(coded)
     return {"kind": "sh", "sh": about, **more}
 
 
@@ -276,15 +311,30 @@ def load(path: str | Path, *, degree: int | None = None) -> ShBtf:
     if about is None:
         raise FormatError(f"{path}: expected a double-SH BTF, found {', '.join(model.names()) or 'nothing'}")
     with store.reading(path):
+        scale = model.read("sh.scale")
+        check_shape("sh.scale", scale, (*about["terms"], 3))
         kept = [n if degree is None else min(n, (degree + 1) ** 2) for n in about["terms"]]
-        rows = [
-            torch.cat([model.read(f"sh.map.{a}.{b}") for b in range(len(bands(kept[1])))], 1)
-            for a in range(len(bands(kept[0])))
-        ]
+        views = bands(kept[1])
+        if "texels" in about:
+            rows = [_opened(model, i, views, about["texels"])[None] for i in range(kept[0])]
+        else:
+            rows = [
+                torch.cat([model.read(f"sh.map.{a}.{b}") for b in range(len(views))], 1)
+                for a in range(len(bands(kept[0])))
+            ]
         return ShBtf(
             maps=torch.cat(rows),
-            scale=model.read("sh.scale")[: kept[0], : kept[1]],
+            scale=scale[: kept[0], : kept[1]],
             offset=model.read("sh.offset")[: kept[0], : kept[1]],
             lights=hemisphere.parse(about["lights"]),
             views=hemisphere.parse(about["views"]),
         )
+
+
+def _opened(model: store.Model, i: int, views: list[slice], texels: list[int]) -> Tensor:
+    """Return the codes (k_v, H, W, 3) of coefficient i of the light."""
+    height, width = texels
+    return torch.cat([
+        code_stream.read(model, f"sh.code.{i}.{b}", (view.stop - view.start, height, width, 3), first=i == b == 0)
+        for b, view in enumerate(views)
+    ])  # fmt: skip

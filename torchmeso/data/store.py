@@ -1,8 +1,9 @@
 """Native files: written beside and renamed, so that nothing is ever half-written, and resumable by blocks.
 
 Raw tables (.btf.zarr, .mdf.zarr) are Zarr 3 groups filled block by block; a job that was cut off leaves
-`<name>.part` with the blocks it finished, and the same job goes on from there. Run-time models (.meso) are
-safetensors files, one tensor per component, memory-mapped: what is not asked for is never read.
+`<name>.part` with the blocks it finished, and the same job goes on from there. Zarr reads a missing block as zeros;
+ours are all written, black ones too, and a finished table that lacks one is refused where it is opened. Run-time models
+(.meso) are safetensors files, one tensor per component, memory-mapped: what is not asked for is never read.
 
 Test: tests/data/test_store.py
 """
@@ -11,6 +12,7 @@ import errno
 import glob
 import hashlib
 import json
+import math
 import os
 import shutil
 from collections.abc import Iterator, Mapping
@@ -58,7 +60,8 @@ class BlockWriter:
 
     def __getitem__(self, name: str) -> zarr.Array:
         """Return the array `name` to write into."""
-        return _array(self._group, name)
+        with zarr.config.set({"array.write_empty_chunks": True}):
+            return _array(self._group, name)
 
     def is_done(self, block: int) -> bool:
         """Return whether an earlier run finished `block`."""
@@ -108,7 +111,7 @@ def _open_blocks(path: Path, specs: Mapping[str, ArraySpec], attributes: dict[st
                 dimension_names=spec.axes,
                 compressors=BloscCodec(cname="lz4", shuffle="shuffle"),
             )
-        group.attrs.update({**attributes, "format": FORMAT_VERSION})
+        group.attrs.update({**attributes, "format": FORMAT_VERSION, "blocks": "all"})
         (part / "key").write_text(key)
     return BlockWriter(part, path, group)
 
@@ -137,7 +140,29 @@ def open_table(path: str | Path, kind: str) -> zarr.Group:
         raise FormatError(f"{path}: expected a {kind} table, got '{about.get('kind', 'something else')}'")
     if about.get("format", 0) > FORMAT_VERSION:
         raise FormatError(f"{path}: written by a newer torchmeso (format {about['format']}); update torchmeso")
+    if about.get("blocks") == "all":
+        with reading(path):
+            _check_blocks(path, group)
     return group
+
+
+def _check_blocks(path: Path, group: zarr.Group) -> None:
+    """Raise FormatError where a file of an array is missing: of all of them only names are read."""
+    for name, array in sorted(group.arrays()):
+        grid = [-(-size // block) for size, block in zip(array.shape, array.shards or array.chunks, strict=True)]
+        folder = path / name / "c"
+        found = {
+            Path(root, file).relative_to(folder).as_posix() for root, _, files in os.walk(folder) for file in files
+        }
+        count = math.prod(grid)
+        if len(found) < count:
+            # One after the other: a damaged file may ask for more than a list could hold.
+            blocks = ("/".join(map(str, np.unravel_index(at, grid))) for at in range(count))
+            missing = next(block for block in blocks if block not in found)
+            raise FormatError(
+                f"{path}: block {missing} of '{name}' is missing, {len(found)} of {count} are there; "
+                "the copy is incomplete, copy or bake it again"
+            )
 
 
 def attributes(group: zarr.Group) -> dict[str, Any]:

@@ -9,7 +9,6 @@ evaluates, has mips and is drawn by the kernels as any other; resident it is as 
 Test: tests/data/test_transform_btf.py
 """
 
-import lzma
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +18,7 @@ import torch
 from jaxtyping import Float, Int16
 from torch import Tensor
 
-from torchmeso.data import mdf, store
+from torchmeso.data import code_stream, mdf, store
 from torchmeso.data.eigen_btf import EigenBtf
 from torchmeso.data.mdf import Mdf
 from torchmeso.errors import FormatError, ShapeError, check_finite, check_shape
@@ -28,8 +27,6 @@ from torchmeso.geometry.hemisphere import DirectionSet
 
 LARGEST_BLOCK = 32
 """Texels along a side of the blocks of the cosine transform."""
-
-CODER = [{"id": lzma.FILTER_LZMA2, "preset": 1, "lc": 0, "lp": 0, "pb": 0}]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -111,7 +108,7 @@ def packed(codes: Int16[Tensor, "term 3 H W"]) -> bytes:
     q = codes.numpy().astype(np.int32).ravel()
     folded = np.where(q < 0, -2 * q - 1, 2 * q).astype("<u2").view(np.uint8)
     planes = np.ascontiguousarray(folded.reshape(-1, 2).T)
-    return lzma.compress(planes.tobytes(), format=lzma.FORMAT_RAW, filters=CODER)
+    return code_stream.squeezed(planes.tobytes())
 
 
 def unpacked(stream: bytes, shape: tuple[int, int, int, int]) -> Int16[Tensor, "term 3 H W"]:
@@ -120,14 +117,9 @@ def unpacked(stream: bytes, shape: tuple[int, int, int, int]) -> Int16[Tensor, "
     Raises:
         FormatError: the stream is damaged, or does not hold `shape`.
     """
-    expected = 2 * math.prod(shape)
-    # The decoder stops one byte after what is expected: no stream makes it allocate more than it holds itself.
-    try:
-        data = lzma.LZMADecompressor(lzma.FORMAT_RAW, filters=CODER).decompress(stream, max(expected, 0) + 1)
-    except lzma.LZMAError as error:
-        raise FormatError(f"transform: a stream is damaged ({error}); the copy may be incomplete") from error
-    if min(shape) < 1 or len(data) != expected:
-        raise FormatError(f"transform: expected {expected} bytes of codes in a stream, got {len(data)}")
+    if min(shape) < 1:
+        raise FormatError(f"transform: expected at least one code, got the shape {shape}; the copy may be incomplete")
+    data = code_stream.opened(stream, 2 * math.prod(shape))
     low, high = np.frombuffer(data, np.uint8).reshape(2, -1).astype(np.int32)
     folded = low + 256 * high
     q = np.where(folded & 1, -((folded + 1) >> 1), folded >> 1).astype(np.int16)

@@ -2,7 +2,8 @@
 
 glTF's textures begin at the top left, so v is turned over; its bitangent, cross(n, t) w, runs along our +v, so w is the
 frame's sign. Looks are base colour and normal map. Meshes are placed by their nodes; skins and morphs stay in
-the pose they were stored in. `glb` writes such files.
+the pose they were stored in. A transform of the base colour's texture (KHR_texture_transform) moves the texture
+coordinates themselves. `glb` writes such files.
 
 Test: tests/geometry/test_gltf.py
 """
@@ -25,8 +26,11 @@ from torchmeso.geometry.mesh_file import Finish, Group, MeshFile, Picture
 MAGIC, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942
 TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
-UNDERSTOOD = {"KHR_mesh_quantization", "KHR_materials_unlit"}
+UNDERSTOOD = {"KHR_mesh_quantization", "KHR_materials_unlit", "KHR_texture_transform"}
 """Extensions that a file may require: numbers of few bits are read anyway."""
+
+MOST_MOVED = 1e6
+"""Offsets and scales of texture coordinates are at most this."""
 
 
 def read(path: Path, uv_set: int = 0) -> MeshFile:
@@ -146,8 +150,13 @@ class _Reader:
         linear, mirrored = matrix[:3, :3], np.linalg.det(matrix[:3, :3]) < 0
         uv_name = f"TEXCOORD_{self.uv_set}"
         uv = self.accessor(attributes[uv_name]).astype(np.float64) if uv_name in attributes else None
+        moved = self.moved(primitive.get("material"))
+        if uv is not None and moved is not None:
+            uv = uv @ moved[:, :2].T + moved[:, 2]
+        # Tangents follow +u as it stands in the file: where it is turned over or round they are made again.
+        upright = moved is None or (moved[0, 0] > 0 and moved[1, 1] > 0 and moved[0, 1] == moved[1, 0] == 0)
         normals = tangents = None
-        if "NORMAL" in attributes and "TANGENT" in attributes:
+        if "NORMAL" in attributes and "TANGENT" in attributes and upright:
             normals = _unit(self.accessor(attributes["NORMAL"]) @ np.linalg.inv(linear))
             given = self.accessor(attributes["TANGENT"]).astype(np.float64)
             sign = np.where(given[:, 3:] < 0, -1.0, 1.0) * (-1 if mirrored else 1)
@@ -183,12 +192,47 @@ class _Reader:
             normal_scale=float(normal.get("scale", 1)),
         )
 
+    def moved(self, material: int | None) -> np.ndarray | None:
+        """Return the 2 x 3 matrix that a material lays over texture coordinates, v downwards; None where it has none.
+
+        One mesh has one set of coordinates: the base colour's transform counts, else the normal map's.
+        """
+        if material is None:
+            return None
+        about = self.json["materials"][material]
+        textures = about.get("pbrMetallicRoughness", {}).get("baseColorTexture"), about.get("normalTexture")
+        matrices = [self.transform(texture) for texture in textures if texture]
+        if len(matrices) == 2 and not np.array_equal(*matrices):
+            warnings.warn(
+                f"{self.path.name}: its normal map is laid by other texture coordinates than its colours; "
+                "it is laid as they are",
+                stacklevel=2,
+            )
+        return None if not matrices or np.array_equal(matrices[0], np.eye(2, 3)) else matrices[0]
+
+    def transform(self, texture: dict) -> np.ndarray:
+        """Return the 2 x 3 matrix of a texture's own transform: scaled, turned counter-clockwise, shifted."""
+        about = texture.get("extensions", {}).get("KHR_texture_transform", {})
+        shift, scale = (np.array(about.get(k, (x, x)), dtype=np.float64) for k, x in (("offset", 0), ("scale", 1)))
+        angle = float(about.get("rotation", 0))
+        if not (np.abs([*shift, *scale, angle]) <= MOST_MOVED).all():
+            raise FormatError(
+                f"{self.path}: KHR_texture_transform: expected numbers up to {MOST_MOVED:g}, got offset "
+                f"{shift.tolist()}, scale {scale.tolist()}, rotation {angle:g}"
+            )
+        # v runs down, so counter-clockwise on the texture is clockwise in numbers (glTF issue 1563).
+        turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+        return np.concatenate([turn * scale, shift[:, None]], 1)
+
     def picture(self, texture: dict | None) -> Picture | None:
         if not texture:
             return None
-        if "KHR_texture_transform" in texture.get("extensions", {}) or texture.get("texCoord", 0) != self.uv_set:
+        asked = (
+            texture.get("extensions", {}).get("KHR_texture_transform", {}).get("texCoord", texture.get("texCoord", 0))
+        )
+        if asked != self.uv_set:
             warnings.warn(
-                f"{self.path.name}: a texture asks for other texture coordinates than set {self.uv_set} as it stands; "
+                f"{self.path.name}: a texture asks for other texture coordinates than set {self.uv_set}; "
                 "it is laid by these",
                 stacklevel=2,
             )

@@ -138,6 +138,27 @@ def boundary(shell: Shell, *, base: Literal["solid", "open"] = "solid") -> Bound
     return Boundary(faces, tet, corner, shell.neighbour[tet, corner])
 
 
+def around(shell: Shell, point: Float[Tensor, "3"]) -> tuple[Int[Tensor, "k"], Float[Tensor, "k 3"]]:
+    """Return the tetrahedra that a point lies in, and its texture coordinates there; several where a shell overlaps."""
+    point = point.double()
+    low, high = shell.vertices.aminmax(dim=0)
+    none = torch.zeros(0, dtype=torch.long), torch.zeros(0, 3, dtype=torch.float64)
+    if not bool(((point >= low) & (point <= high)).all()):
+        return none
+    corner = shell.vertices[shell.tets]
+    near = ((corner.amin(1) <= point) & (corner.amax(1) >= point)).all(1).nonzero()[:, 0]
+    if len(near) == 0:
+        return none
+    base = corner[near, 0]
+    sides = (corner[near, 1:] - base[:, None]).mT
+    proper = torch.linalg.det(sides).abs() > 1e-300
+    near, base, sides = near[proper], base[proper], sides[proper]
+    others = torch.linalg.solve(sides, (point - base)[..., None])[..., 0]
+    share = torch.cat([1 - others.sum(1, keepdim=True), others], 1)
+    inside = (share >= 0).all(1)
+    return near[inside], (share[inside, :, None] * shell.uvz[near[inside]]).sum(1)
+
+
 def left_of(
     p: Float[Tensor, "*batch 2"], q: Float[Tensor, "*batch 2"], p_id: Int[Tensor, "*batch"], q_id: Int[Tensor, "*batch"]
 ) -> Bool[Tensor, "*batch"]:

@@ -12,16 +12,17 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import cache, partial
 from pathlib import Path
+from typing import Any, NamedTuple
 
 from torchmeso.compress import stream
 from torchmeso.compress.double_sh import DoubleShOptions
 from torchmeso.compress.eigen import EigenOptions
 from torchmeso.compress.sh_pca import ShPcaOptions
 from torchmeso.config import Config, MaterialConfig, MesoConfig
-from torchmeso.data import btf, eigen_btf, journal, mdf, sh_btf, sh_pca_btf, store, textured, transform_btf
+from torchmeso.data import btf, eigen_btf, gdm, journal, mdf, sh_btf, sh_pca_btf, store, textured, transform_btf
 from torchmeso.errors import ConfigError, FormatError
 from torchmeso.geometry.mesh_file import Finish
-from torchmeso.meso import bake_btf, bake_mdf
+from torchmeso.meso import bake_btf, bake_gdm, bake_mdf
 from torchmeso.render.scene import Material
 
 Report = Callable[[str, float], None]
@@ -69,6 +70,8 @@ def prepare_material(name: str, material: MaterialConfig, report: Report = silen
     """Return one material, baked and compressed or from the cache; without `depth` its MDF stays on disk."""
     if material.finish is not None:
         return Asset(material=plain(material.finish), seconds={}, raw_bytes=0, model_bytes=0)
+    if material.in_shell:
+        return _prepare_gdm(name, material, report)
     if material.model is not None:
         opened = open_model(material.model, depth=depth, rank=material.rank)
         return Asset(material=opened, seconds={}, raw_bytes=0, model_bytes=Path(material.model).stat().st_size)
@@ -83,6 +86,15 @@ def prepare_material(name: str, material: MaterialConfig, report: Report = silen
     raw = sum(_size_on_disk(p) for p in table_paths(material))
     opened = open_model(model, depth=depth)
     return Asset(material=opened, seconds=seconds, raw_bytes=raw, model_bytes=model.stat().st_size)
+
+
+def _prepare_gdm(name: str, material: MaterialConfig, report: Report) -> Asset:
+    """Return a material in a shell: its GDM baked, from the cache, or as it is given."""
+    seconds: dict[str, float] = {}
+    path = Path(material.model) if material.model is not None else bake_tables(name, material, report, seconds)[0]
+    table = Material(gdm=gdm.load(path), shell=material.shell, albedo=material.floor)
+    size = _size_on_disk(path)
+    return Asset(material=table, seconds=seconds, raw_bytes=size if material.model is None else 0, model_bytes=size)
 
 
 def _compress(name: str, btf_table: Path, mdf_table: Path, material: MaterialConfig, out: Path, report: Report) -> None:
@@ -113,8 +125,8 @@ def bake_tables(
     *,
     out: Path | None = None,
     force: bool = False,
-) -> tuple[Path, Path]:
-    """Bake the BTF and the MDF of a material into the cache, or into the folder `out` under its name.
+) -> tuple[Path, ...]:
+    """Bake the BTF and the MDF of a material, or its GDM, into the cache or into the folder `out` under its name.
 
     Raises:
         ConfigError: there is nothing to bake, or another table lies in `out` and `force` is not given.
@@ -123,7 +135,7 @@ def bake_tables(
         raise ConfigError(f"materials.{name}: expected a mesostructure ('meso') to bake, found none")
     paths = table_paths(material)
     if out is not None:
-        paths = (out / f"{name}.btf.zarr", out / f"{name}.mdf.zarr")
+        paths = tuple(out / f"{name}.{table.kind}.zarr" for table in _tables(material))
     keys = _keys(material)
     if all(_is_finished(path, key) for path, key in zip(paths, keys, strict=True)):
         return paths
@@ -133,20 +145,28 @@ def bake_tables(
         with store.writing(path):
             path.parent.mkdir(parents=True, exist_ok=True)
     meso = material.meso.build()
-    about: dict[str, object] = {"source": {"type": material.meso.type, **material.meso.arguments}}
-    start = time.perf_counter()
-    if not _is_finished(paths[1], keys[1]):
-        bake_mdf.bake(
-            meso, material.mdf, paths[1], about={**about, "key": keys[1]}, progress=lambda x: report(f"{name}: MDF", x)
-        )
-    seconds["mdf"] = time.perf_counter() - start
-    start = time.perf_counter()
-    if not _is_finished(paths[0], keys[0]):
-        bake_btf.bake(
-            meso, material.btf, paths[0], about={**about, "key": keys[0]}, progress=lambda x: report(f"{name}: BTF", x)
-        )
-    seconds["btf"] = time.perf_counter() - start
+    source = {"type": material.meso.type, **material.meso.arguments}
+    for table, path, key in reversed(list(zip(_tables(material), paths, keys, strict=True))):
+        start = time.perf_counter()
+        if not _is_finished(path, key):
+            told = partial(report, f"{name}: {table.kind.upper()}")
+            table.bake(meso, table.options, path, about={"source": source, "key": key}, progress=told)
+        seconds[table.kind] = time.perf_counter() - start
     return paths
+
+
+class _Table(NamedTuple):
+    """A table that a material needs."""
+
+    kind: str
+    options: Any
+    bake: Callable[..., None]
+
+
+def _tables(material: MaterialConfig) -> tuple[_Table, ...]:
+    if material.gdm is not None:
+        return (_Table("gdm", material.gdm, bake_gdm.bake),)
+    return (_Table("btf", material.btf, bake_btf.bake), _Table("mdf", material.mdf, bake_mdf.bake))
 
 
 def open_model(path: str | Path, *, depth: bool = True, rank: int | None = None) -> Material:
@@ -173,10 +193,10 @@ def open_model(path: str | Path, *, depth: bool = True, rank: int | None = None)
     return Material(btf=reflectance, mdf=mdf.from_model(model) if depth else None)
 
 
-def table_paths(material: MaterialConfig) -> tuple[Path, Path]:
-    """Return where the cache keeps the BTF and the MDF of a material."""
-    btf_key, mdf_key = _keys(material)
-    return store.cache_dir() / f"{btf_key}.btf.zarr", store.cache_dir() / f"{mdf_key}.mdf.zarr"
+def table_paths(material: MaterialConfig) -> tuple[Path, ...]:
+    """Return where the cache keeps the BTF and the MDF of a material, or its GDM."""
+    kinds = (table.kind for table in _tables(material))
+    return tuple(store.cache_dir() / f"{key}.{kind}.zarr" for key, kind in zip(_keys(material), kinds, strict=True))
 
 
 def model_path(material: MaterialConfig) -> Path:
@@ -217,16 +237,16 @@ def file_hash(path: str | Path) -> str:
     return hashlib.sha256(Path(path).read_bytes()).hexdigest()[:24]
 
 
-def _keys(material: MaterialConfig) -> tuple[str, str]:
+def _keys(material: MaterialConfig) -> tuple[str, ...]:
     assert material.meso is not None
     about = [describe_meso(material.meso), code_hash()]
-    return store.content_hash(about, asdict(material.btf)), store.content_hash(about, asdict(material.mdf))
+    return tuple(store.content_hash(about, asdict(table.options)) for table in _tables(material))
 
 
 def _is_finished(path: Path, key: str) -> bool:
     if not path.is_dir():
         return False
-    kind = "btf" if path.name.endswith(".btf.zarr") else "mdf"
+    kind = path.name.split(".")[-2]
     return store.attributes(store.open_table(path, kind)).get("key") == key
 
 

@@ -157,46 +157,47 @@ def _gdm(path: Path) -> dict[str, Any]:
 def _model(path: Path) -> dict[str, Any]:
     model = store.Model(path)
     about: dict[str, Any] = {"kind": f"run-time model ({model.meta.get('kind', 'unknown')})"}
-    if "eigen" in model.meta:
-        eigen = model.meta["eigen"]
-        first = model.read("eigen.map.0")
-        about |= {
-            "rank": eigen["rank"],
-            "lights": eigen["lights"],
-            "views": eigen["views"],
-            "texels": f"{first.shape[2]} x {first.shape[1]}",
-            "storage": str(first.dtype).removeprefix("torch."),
-            "BTF data": _held(model, "eigen."),
-        }
-    if "sh" in model.meta:
-        sh = model.meta["sh"]
-        first = model.read("sh.map.0.0")
-        about |= {
-            "coefficients": "{} x {} of light and view".format(*sh["terms"]),
-            "domain": sh["domain"],
-            "lights": sh["lights"],
-            "views": sh["views"],
-            "texels": f"{first.shape[3]} x {first.shape[2]}",
-            "storage": str(first.dtype).removeprefix("torch."),
-            "BTF data": _held(model, "sh."),
-        }
-    if "sh_pca" in model.meta:
-        with store.reading(path):
-            about |= _sh_pca(model)
-    if "transform" in model.meta:
-        transform = model.meta["transform"]
-        about |= {
-            "rank": transform["rank"],
-            "lights": transform["lights"],
-            "views": transform["views"],
-            "texels": "{1} x {0}".format(*transform["texels"]),
-            "PSNR when fitted (dB)": model.meta.get("psnr", "unknown"),
-            "BTF data": _held(model, "transform."),
-        }
-    if "mdf" in model.meta:
-        about["MDF"] = f"{model.meta['mdf']['directions']}, h = {model.meta['mdf']['h']:g} tiles"
-        about["MDF data"] = _held(model, "mdf.")
+    kinds = {"eigen": _eigen, "sh": _double_sh, "sh_pca": _sh_pca, "transform": _transform}
+    with store.reading(path):
+        for kind, told in kinds.items():
+            if kind in model.meta:
+                about |= {**told(model), **_psnr(model), "BTF data": _held(model, f"{kind}.")}
+        if "mdf" in model.meta:
+            about["MDF"] = f"{model.meta['mdf']['directions']}, h = {model.meta['mdf']['h']:g} tiles"
+            about["MDF data"] = _held(model, "mdf.")
     return {**about, "on disk": _size(path)}
+
+
+def _eigen(model: store.Model) -> dict[str, Any]:
+    eigen = model.meta["eigen"]
+    about = {name: eigen[name] for name in ("rank", "lights", "views")}
+    return {**about, **_maps(model, eigen, "eigen.map.0")}
+
+
+def _double_sh(model: store.Model) -> dict[str, Any]:
+    sh = model.meta["sh"]
+    about = {name: sh[name] for name in ("domain", "lights", "views")}
+    terms = "{} x {} of light and view".format(*sh["terms"])
+    return {"coefficients": terms, **about, **_maps(model, sh, "sh.map.0.0")}
+
+
+def _maps(model: store.Model, about: dict[str, Any], first: str) -> dict[str, Any]:
+    """Return size and storage of maps (..., H, W, 3), of which `first` is one."""
+    if "texels" in about:
+        return {"texels": "{1} x {0}".format(*about["texels"]), "storage": "uint8, adaptive steps, entropy-coded"}
+    maps = model.read(first)
+    return {"texels": f"{maps.shape[-2]} x {maps.shape[-3]}", "storage": str(maps.dtype).removeprefix("torch.")}
+
+
+def _transform(model: store.Model) -> dict[str, Any]:
+    transform = model.meta["transform"]
+    about = {name: transform[name] for name in ("rank", "lights", "views")}
+    return {**about, "texels": "{1} x {0}".format(*transform["texels"])}
+
+
+def _psnr(model: store.Model) -> dict[str, Any]:
+    """Return the error, where a fit was made to a budget and knew it."""
+    return {"PSNR when fitted (dB)": model.meta["psnr"]} if "psnr" in model.meta else {}
 
 
 def _sh_pca(model: store.Model) -> dict[str, Any]:
@@ -209,7 +210,6 @@ def _sh_pca(model: store.Model) -> dict[str, Any]:
         "views": sh["views"],
         "texels": f"{first.shape[2]} x {first.shape[1]}",
         "storage": str(first.dtype).removeprefix("torch."),
-        "BTF data": _held(model, "sh_pca."),
     }
 
 

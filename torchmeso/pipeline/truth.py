@@ -87,10 +87,10 @@ def _surfaces(config: Config) -> Iterator[tuple[int, Geometry]]:
         places = item.places()
         # A similarity carries displaced triangles as it carries the mesh: each body is displaced once.
         for k, look in enumerate(body.looks):
-            geometry = _geometry(config, mesos, _only(body, k), look)
-            for i, matrix in enumerate(places):
-                vertices = geometry.vertices.double() @ matrix[:3, :3].double().T + matrix[:3, 3].double()
-                yield first + i, replace(geometry, vertices=vertices.float())
+            for geometry in _geometries(config, mesos, _only(body, k), look):
+                for i, matrix in enumerate(places):
+                    vertices = geometry.vertices.double() @ matrix[:3, :3].double().T + matrix[:3, 3].double()
+                    yield first + i, replace(geometry, vertices=vertices.float())
         first += len(places)
 
 
@@ -100,6 +100,33 @@ def _only(body: Body, k: int) -> Mesh:
         return body.mesh
     mine = body.part == k
     return replace(body.mesh, faces=body.mesh.faces[mine], component=body.mesh.component[mine])
+
+
+def _geometries(config: Config, mesos: dict[str, Mesostructure], body: Mesh, look: str | Finish) -> Iterator[Geometry]:
+    """Yield what a body is made of: its surface, displaced, and the floor of a solid shell."""
+    material = config.materials[look] if isinstance(look, str) else None
+    if material is None or material.gdm is None:
+        yield _geometry(config, mesos, body, look)
+        return
+    h = mesos[str(look)].h
+    lift = h if material.shell.side == "outward" else 0.0
+    yield _geometry(config, mesos, _moved(body, lift), look)
+    if material.shell.base == "solid":
+        floor = _moved(body, lift - h)
+        yield Geometry(
+            vertices=floor.vertices.float(),
+            faces=floor.faces,
+            part=torch.zeros(len(floor.faces), dtype=torch.long),
+            palette=palette((material.floor, 1.0, 0.0)),
+            albedo_map=None,
+            uv=floor.uv,
+        )
+
+
+def _moved(body: Mesh, height: float) -> Mesh:
+    """Return a mesh moved along its normals, by tile units."""
+    shift = height * body.scale.double()[:, None] * body.normals.double()
+    return replace(body, vertices=(body.vertices.double() + shift).to(body.vertices.dtype))
 
 
 def _geometry(config: Config, mesos: dict[str, Mesostructure], body: Mesh, look: str | Finish) -> Geometry:

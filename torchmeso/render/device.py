@@ -21,7 +21,7 @@ RECORD = ("n", "t", "uv", "scale", "sign")
 """What a vertex holds, in this order, in sixteen floats."""
 
 FACET = np.dtype(
-    [(name, "i4") for name in ("object", "pad")]
+    [(name, "i4") for name in ("object", "entry")]
     + [(name, "f4") for name in ("turn", "scale")]
     + [("normal", "f4", 3), ("corner", "i4", 3), ("first", "f4", 3), ("second", "f4", 3)]
 )
@@ -55,9 +55,13 @@ def upload_geometry(world: World) -> DeviceGeometry:
     Raises:
         BackendError: there is no device.
     """
+    dressed = torch.zeros(len(world.object), dtype=torch.bool)
+    dressed[[s.surface for s in world.shells]] = True  # shells are left through faces that nobody asks for
+    number = world.object[world.owner]
+    number = torch.where(dressed[world.owner], ~number, number)
     tag = (world.component << 2) | (world.closed[world.component].long() << 1)
     return DeviceGeometry(
-        upload_mesh(world.vertices, world.faces, torch.stack([tag, world.object[world.owner]], 1)),
+        upload_mesh(world.vertices, world.faces, torch.stack([tag, number], 1)),
         opencl.upload(vertex_records(world)),
         opencl.upload(face_records(world, torch.stack([tag, world.owner], 1))),
     )
@@ -79,7 +83,7 @@ def face_records(world: World, tags: Int[Tensor, "F 2"]) -> np.ndarray:
     a, b, c = (e1 * e1).sum(-1), (e1 * e2).sum(-1), (e2 * e2).sum(-1)
     area = (a * c - b * b).clamp(min=1e-30)[:, None]
     facets = np.zeros(len(world.faces), FACET)
-    facets["object"] = tags[:, 1].numpy()
+    facets["object"], facets["entry"] = tags[:, 1].numpy(), world.entry.numpy()
     facets["normal"], facets["corner"] = normal.numpy(), world.faces.numpy()
     facets["first"] = ((c[:, None] * e1 - b[:, None] * e2) / area).numpy()
     facets["second"] = ((a[:, None] * e2 - b[:, None] * e1) / area).numpy()

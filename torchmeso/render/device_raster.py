@@ -38,7 +38,7 @@ COUNTERS = (
     "used", "vectors", "slots", "tile", "crossing", "behind", "degenerate", "drawn", "fragments",
     "deepest", "covered", "intervals", "deep", "carved", "inside", "hidden", "looked", "spared", "empty",
     "beside", "turned", "losers", "bounded", "near_bodies", "averted", "kept",
-    "stamps", "asked",
+    "stamps", "asked", "prisms", "tets", "endless",
 )  # fmt: skip
 """What the kernels count, in the order of `Counters` in kernels_cl/render/rasterize.clh; padded to 32."""
 
@@ -55,7 +55,8 @@ class DeviceMesh(NamedTuple):
     Attributes:
         vertices: (V, 3) float64.
         faces: (F, 3) int32.
-        tags: (F, 2) int32: component << 2 | 2 where it is closed; object.
+        tags: (F, 2) int32: component << 2 | 2 where it is closed; object, or ~object where a face is only there for
+            rays that meet its front.
         objects: (object,) see `BOX`.
         balls: (object, 4) centre and radius of a ball around each object.
         ball: of one around all.
@@ -94,10 +95,11 @@ def upload_mesh(
         BackendError: there is no OpenCL device.
     """
     tags = torch.zeros(len(faces), 2, dtype=torch.int32) if tags is None else tags
-    n_object = int(tags[:, 1].max()) + 1 if len(tags) else 1
+    number = torch.where(tags[:, 1] < 0, ~tags[:, 1], tags[:, 1])
+    n_object = int(number.max()) + 1 if len(tags) else 1
     objects, balls = np.zeros(n_object, BOX), np.zeros((n_object, 4))
-    order = torch.argsort(tags[:, 1], stable=True)  # faces object by object: each is looked at once
-    for i, own in enumerate(order.split(torch.bincount(tags[:, 1], minlength=n_object).tolist())):
+    order = torch.argsort(number, stable=True)  # faces object by object: each is looked at once
+    for i, own in enumerate(order.split(torch.bincount(number, minlength=n_object).tolist())):
         objects["centre"][i], objects["reach"][i], radius = _around(vertices[faces[own]])
         objects["body"][i] = bool((tags[own, 0] & 2).any())
         balls[i] = *objects["centre"][i], radius

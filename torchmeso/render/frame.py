@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchmeso.errors import check_memory, check_range
 from torchmeso.geometry.camera import Camera
-from torchmeso.render import film, shadow_map
+from torchmeso.render import film, gdm_shade, shadow_map
 from torchmeso.render.btf_shade import shade
 from torchmeso.render.film import Picture
 from torchmeso.render.rasterize import Layers, rasterize
@@ -113,7 +113,7 @@ def _render(scene: Scene, camera: Camera, options: FrameOptions) -> Picture:
     with _timed(seconds, "visibility"):
         candidates, counts = find_candidates(scene, world, camera, layers, options.silhouette)
         first = nearest(candidates, candidates.depth)
-        seen = Candidates(*(x[first] for x in candidates))
+        seen = candidates.select(first)
     with _timed(seconds, "shading"):
         picture = _develop(scene, world, camera, layers, seen, maps, options)
     return Picture(**picture, counts=_count(layers, counts, camera), seconds=seconds)
@@ -143,20 +143,26 @@ def _develop(
     shadowed = torch.zeros(len(scene.lights), n_pixel, dtype=torch.bool)
     depth[seen.pixel] = seen.depth
 
-    inside = seen.pixel[seen.fragment < 0]
+    inside = seen.pixel[(seen.fragment < 0) & (seen.prism < 0)]
     rgb[inside], owner[inside] = 0, -2
-    outside = seen.fragment >= 0
-    pixel, fragment = seen.pixel[outside], seen.fragment[outside]
-    points = interpolate(world, layers, camera, fragment)
-    owner[pixel] = world.object[points.owner]
-    origin, direction, _ = rays(camera, pixel, dtype)
-    receiver = origin + seen.depth[outside, None] * direction
-    dark = torch.zeros(len(scene.lights), len(pixel), dtype=torch.bool)
-    for l, shadow in enumerate(maps):
-        dark[l] = shadow_map.blocked(shadow, receiver)
-    shadowed[:, pixel] = dark
+    met = seen.select(seen.prism >= 0)
+    plain = seen.select((seen.fragment >= 0) & (seen.prism < 0))
+    points = interpolate(world, layers, camera, plain.fragment)
+    owner[plain.pixel] = world.object[points.owner]
+    origin, direction, _ = rays(camera, plain.pixel, dtype)
+    dark = _blocked(scene, maps, origin + plain.depth[:, None] * direction)
+    shadowed[:, plain.pixel] = dark
     samples = options.antialias if options.filtering else None
-    rgb[pixel] = shade(scene, points, -direction, dark, samples=samples)
+    rgb[plain.pixel] = shade(scene, points, -direction, dark, samples=samples)
+
+    if len(met.pixel):
+        origin, direction, _ = rays(camera, met.pixel, dtype)
+        shell_points = gdm_shade.points(world, met.prism, met.place, met.floor, origin + met.depth[:, None] * direction)
+        owner[met.pixel] = world.object[shell_points.owner]
+        depths = torch.tensor([0.0 if m.gdm is None else m.gdm.h for m in scene.surfaces], dtype=dtype)
+        dark = _blocked(scene, maps, shell_points.position, depths[shell_points.owner] * shell_points.scale)
+        shadowed[:, met.pixel] = dark
+        rgb[met.pixel] = gdm_shade.shade(scene, shell_points, -direction, dark, shadows=options.shadows)
 
     size = (camera.height, camera.width)
     return {
@@ -165,6 +171,14 @@ def _develop(
         "owner": owner.reshape(size),
         "shadowed": shadowed.reshape(-1, *size),
     }
+
+
+def _blocked(scene: Scene, maps: list[shadow_map.ShadowMap], position: Tensor, slack: Tensor | None = None) -> Tensor:
+    """Return whether each light is blocked at positions."""
+    dark = torch.zeros(len(scene.lights), len(position), dtype=torch.bool)
+    for l, shadow in enumerate(maps):
+        dark[l] = shadow_map.blocked(shadow, position, slack)
+    return dark
 
 
 def _count(layers: Layers, counts: Counts, camera: Camera) -> dict[str, int]:

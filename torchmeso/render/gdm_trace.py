@@ -4,6 +4,9 @@ wang2004gdm, section 3.2: in object space a ray passes prisms one after the othe
 is taken as straight, and one look-up tells whether material lies on it. Further look-ups (`queries`) go on from where
 the one before says that nothing is yet, and end closer to the material.
 
+A table decides by the majority of its samples, and may let a ray pass that then begins its way through the next prism
+inside of material. Such a ray met it in the prism before, where the minority told of it.
+
 Test: tests/render/test_gdm_trace.py
 """
 
@@ -24,6 +27,12 @@ MOST_STEPS = 4096
 NUDGES = (1e-9, 1e-7, 1e-5, 1e-3, 0.0)
 """A ray beside the face it comes in by is moved by these shares of the way to its middle, one after the other."""
 
+TIE = 1e-6
+"""Tile units: material that lies at the very end of a way is met."""
+
+SHORT = 1e-5
+"""Ways in texture space, tile units, that rounding makes or leaves out: past an edge or a corner."""
+
 INTO = OUTWARD.flip(1)
 """Corners of the face a ray came in through, counter-clockwise seen by the ray."""
 
@@ -35,13 +44,15 @@ class Entries(NamedTuple):
         origin: (n, 3) float64.
         direction: (n, 3) unit.
         tet: (n,) tetrahedron behind the face.
-        corner: (n,) its corner opposite the face.
+        corner: (n,) its corner opposite the face; -1: the ray begins inside of the tetrahedron.
+        place: (n, 3) texture coordinates of rays that begin inside; None where none does.
     """
 
     origin: Float[Tensor, "n 3"]
     direction: Float[Tensor, "n 3"]
     tet: Int[Tensor, "n"]
     corner: Int[Tensor, "n"]
+    place: Float[Tensor, "n 3"] | None = None
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -55,7 +66,7 @@ class Traced:
         direction: (n, 3) unit direction of the last way in texture space.
         prism: (n,) the last prism.
         through: (n,) what the ray left through: BOTTOM, TOP, BORDER; 0 where it hit.
-        prisms: (n,) prisms passed.
+        prisms: (n,) prisms passed, those not counted in which the way is shorter than `SHORT`.
     """
 
     hit: Bool[Tensor, "n"]
@@ -84,12 +95,17 @@ def trace(shell: Shell, gdm: Gdm | None, entries: Entries, *, queries: int = 1, 
     axes = around(entries.direction.double())
     rays = _Rays(entries.origin.double(), torch.stack([axes.t, axes.b, axes.n], 1))
     tet, corner = entries.tet.clone(), entries.corner.clone()
+    within = corner < 0
+    corner[within] = _behind(shell, _Rays(rays.origin[within], rays.axes[within]), tet[within])
     rays, enters = _into_face(shell, rays, tet, corner)
     share = _shares(shell, rays, tet, corner)
     start_t, start = share.t.clone(), share.place.clone()
+    if entries.place is not None:
+        start_t[within], start[within] = 0, entries.place[within].double()
     hit, t = torch.zeros(n, dtype=torch.bool), share.t.clone()
     place, direction = share.place.clone(), torch.zeros(n, 3, dtype=torch.float64)
-    prism, through, prisms = tet // 3, torch.zeros(n, dtype=torch.long), torch.ones(n, dtype=torch.long)
+    prism, through, prisms = tet // 3, torch.zeros(n, dtype=torch.long), torch.zeros(n, dtype=torch.long)
+    overlooked = _Overlooked(torch.full((n,), torch.inf, dtype=torch.float64), place.clone(), prism.clone())
     active = enters.nonzero()[:, 0]
     through[~enters] = shell.neighbour[tet, corner][~enters]
     for _ in range(MOST_STEPS):
@@ -104,12 +120,18 @@ def trace(shell: Shell, gdm: Gdm | None, entries: Entries, *, queries: int = 1, 
         way = at.place[now] - start[ray]
         length = way.norm(dim=-1)
         v = way / length.clamp(min=1e-30)[:, None]
+        prisms[ray] += length > SHORT
         direction[ray] = torch.where(length[:, None] > 0, v, direction[ray])
-        met, d = _meet(gdm, start[ray], v, length, queries)
-        part = torch.where(length > 0, d / length.clamp(min=1e-30), 0)
-        t[ray] = torch.where(met, start_t[ray] + part * (at.t[now] - start_t[ray]), at.t[now])
+        met, d, near, sunk = _meet(gdm, start[ray], v, length, queries)
+        per_length = (at.t[now] - start_t[ray]) / length.clamp(min=1e-30)
+        t[ray] = torch.where(met, start_t[ray] + d * per_length, at.t[now])
         place[ray] = torch.where(met[:, None], start[ray] + d[:, None] * v, at.place[now])
         hit[ray] = met
+        before = ray[sunk & overlooked.t[ray].isfinite()]
+        t[before], place[before], prism[before] = (x[before] for x in overlooked)
+        passed = torch.where(near <= length, start_t[ray] + near.clamp(max=1e30) * per_length, torch.inf)
+        overlooked.t[ray], overlooked.prism[ray] = passed, prism[ray]
+        overlooked.place[ray] = start[ray] + torch.where(near <= length, near, 0)[:, None] * v
         gone = ~met & (ahead[now] < 0)
         through[ray[gone]] = ahead[now][gone]
         done = torch.zeros(len(active), dtype=torch.bool)
@@ -124,11 +146,18 @@ def trace(shell: Shell, gdm: Gdm | None, entries: Entries, *, queries: int = 1, 
         entered = _shares(shell, _Rays(rays.origin[fresh], rays.axes[fresh]), tet[fresh], corner[fresh])
         start[fresh], start_t[fresh] = entered.place, entered.t
         prism[fresh] = tet[fresh] // 3
-        prisms[fresh] += 1
         active = onward
     if floor:
         hit |= through == BOTTOM
     return Traced(hit=hit, t=t, place=place, direction=direction, prism=prism, through=through, prisms=prisms)
+
+
+class _Overlooked(NamedTuple):
+    """What rays may have met in the prism before: (n,) t, inf where nothing; (n, 3) place; (n,) prism."""
+
+    t: Tensor
+    place: Tensor
+    prism: Tensor
 
 
 class _Rays(NamedTuple):
@@ -170,6 +199,17 @@ def _into_face(shell: Shell, rays: _Rays, tet: Tensor, corner: Tensor) -> tuple[
     return _Rays(origin, rays.axes), enters
 
 
+def _behind(shell: Shell, rays: _Rays, tet: Tensor) -> Tensor:
+    """Return the corner of `tet` opposite the face by which rays would have come in that begin inside of it."""
+    found = torch.zeros_like(tet)
+    for corner in range(4):
+        vertex = shell.tets[tet][:, INTO[corner]]
+        p = _seen(shell, rays, vertex)[..., :2]
+        inside = left_of(p, p.roll(-1, 1), vertex, vertex.roll(-1, 1)).all(1)
+        found[inside] = corner
+    return found
+
+
 def _shares(shell: Shell, rays: _Rays, tet: Tensor, corner: Tensor) -> _Share:
     """Return where rays pass the face of a tetrahedron opposite `corner`."""
     local = OUTWARD[corner]
@@ -206,25 +246,34 @@ def _facing(shell: Shell, tet: Tensor, before: Tensor) -> Tensor:
     return (shell.neighbour[tet] == before[:, None]).int().argmax(1)
 
 
-def _meet(gdm: Gdm | None, start: Tensor, v: Tensor, length: Tensor, queries: int) -> tuple[Tensor, Tensor]:
-    """Return whether material lies on straight ways in texture space, and how far along."""
+def _meet(
+    gdm: Gdm | None, start: Tensor, v: Tensor, length: Tensor, queries: int
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return whether material lies on straight ways in texture space, and how far along.
+
+    Also how far along it lies by those samples that tell of it, and whether the ways begin inside of it.
+    """
     met, d = torch.zeros(len(start), dtype=torch.bool), torch.zeros(len(start), dtype=torch.float64)
+    near, sunk = torch.full_like(d, torch.inf), torch.zeros_like(met)
     if gdm is None or not len(start):
-        return met, length
+        return met, length, near, sunk
     active, asked = torch.arange(len(start)), 0
     layers, height, width = gdm.voxels
-    near = max(1 / width, 1 / height, gdm.h / (layers - 1))
+    voxel = max(1 / width, 1 / height, gdm.h / (layers - 1))
     while len(active):
         found = gdm.evaluate(start[active] + d[active, None] * v[active], v[active])
         reach = d[active] + found.distance
+        near[active] = d[active] + found.near
         asked += 1
-        beyond = reach > length[active]
-        last = (found.distance < near) | (asked >= queries)
+        beyond = reach > length[active] + TIE
+        last = (found.distance < voxel) | (asked >= queries)
         stops = ~found.left & ~beyond & last
         met[active[stops]] = True
+        if asked == 1:
+            sunk = met & (found.distance <= 0)
         # Asked again a voxel before the material, where the table is at its best; and where the table ends before the
         # way does, from there on, whatever the number of queries.
-        step = torch.where(found.left | last, found.distance, found.distance - near)
+        step = torch.where(found.left | last, found.distance, found.distance - voxel)
         d[active] = torch.minimum(d[active] + step, length[active])
         active = active[~stops & ~beyond & (found.distance > 1e-9)]
-    return met, d
+    return met, d, near, sunk

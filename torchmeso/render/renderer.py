@@ -9,26 +9,30 @@ changed. The torch frame (`frame.render`) is the formula of all of this.
 Kernels: kernels_cl/render/renderer.cl, kernels_cl/render/shadow_map.cl          Test: tests/render/test_renderer.py
 """
 
+import itertools
 import operator
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 from torch import Tensor
 
 from torchmeso.backends import opencl
 from torchmeso.data import image
 from torchmeso.errors import BackendError, check_memory
+from torchmeso.geometry import shell
 from torchmeso.geometry.camera import Camera
 from torchmeso.geometry.light import DirectionalLight, Light, SpotLight
-from torchmeso.render import device, device_tables, film, shadow_map
+from torchmeso.render import device, device_gdm, device_shell, device_tables, film, shadow_map
+from torchmeso.render.casters import Corners, corners_of
 from torchmeso.render.device_raster import ROOM, STAMPS, DeviceViews
 from torchmeso.render.film import Picture
 from torchmeso.render.frame import MEMORY_LIMIT, FrameOptions
-from torchmeso.render.scene import Scene, World, assemble
+from torchmeso.render.scene import Material, Scene, World, assemble
 
 MAX_LIGHTS = 64
 """Of a frame, as in kernels_cl/render/shadow_map.clh."""
@@ -36,10 +40,15 @@ MAX_LIGHTS = 64
 DETAILS, DISPLAY = 1, 2
 """What a frame writes: a `Picture`, or bytes for a screen."""
 
+MOST_STARTS = 4
+"""Tetrahedra of shells that the eye is in; the others of a shell that overlaps itself more often are left out."""
+
 FRAME = np.dtype(
     [(name, "i4") for name in ("lights", "ambient_paper", "depths", "outputs")]
     + [(name, "i4") for name in ("capacity", "skips", "stride", "pitch")]
-    + [("ambient", "f4"), ("background", "f4", 3), ("rank_error", "f4"), ("pixel", "f4"), ("pad", "i4", 2)]
+    + [("ambient", "f4"), ("background", "f4", 3), ("rank_error", "f4"), ("pixel", "f4")]
+    + [("starts", "i4"), ("pad", "i4"), ("start_tet", "i4", MOST_STARTS), ("start_surface", "i4", MOST_STARTS)]
+    + [("start_place", "f4", (MOST_STARTS, 4))]
 )
 
 
@@ -101,6 +110,7 @@ class Renderer:
             ("-DONE_LAYER", self._one_layer),
             ("-DMIXED", mixed),
             ("-DHARMONICS", self._on_device.materials.harmonic),
+            ("-DGDM", self._on_device.shells is not None),
         )
         self._defines = (f"-DSILHOUETTE={mode}", *(name for name, needed in wanted if needed))
         self._plain = mode == 0 and self.options.silhouette != "none"
@@ -287,7 +297,7 @@ class Renderer:
                 (views.views, views.triangles, views.slots, views.labels, views.boxes, views.coarse, views.counters,
                  geometry.records, geometry.facets, materials.tables, materials.mdfs, np.int32(number),
                  np.int32(views.stride), capacity, np.int32(maps.room), np.int32(self._skip_bits()), *self._layers(),
-                 *maps.stored),
+                 *maps.stored, *self._on_device.of_shells),
                 self._defines,
             )
             for number in range(views.count)
@@ -312,6 +322,10 @@ class Renderer:
         frame["pixel"] = camera.pixel_size / self.options.antialias
         frame["pitch"] = picture.rgba.shape[1]
         frame["ambient"], frame["background"] = scene.ambient, scene.background
+        frame["starts"] = 0
+        for k, start in enumerate(itertools.islice(self._on_device.starts(camera), MOST_STARTS)):
+            frame["start_tet"][k], frame["start_surface"][k], frame["start_place"][k, :3] = start
+            frame["starts"] = k + 1
         picture.frame.send()
         if outputs != picture.outputs:
             picture.empty.array[:] = 0
@@ -353,7 +367,7 @@ class Renderer:
              geometry.records, geometry.facets, materials.tables, materials.mdfs, materials.reflectances,
              picture.lights.buffer, lights.views, lights.slots, lights.labels, lights.counters, *stored,
              picture.frame.buffer, *self._layers(),
-             *(b for b, _ in picture.results), picture.empty.buffer),
+             *(b for b, _ in picture.results), picture.empty.buffer, *self._on_device.of_shells),
             (*self._defines, *(["-DSHADOWS"] * self.options.shadows), *(["-DFILTERED"] * self.options.filtering)),
         )  # fmt: skip
 
@@ -365,8 +379,23 @@ class _OnDevice(NamedTuple):
     world: World
     geometry: device.DeviceGeometry
     materials: device_tables.DeviceMaterials
-    corners: Float[np.ndarray, "3 V"]  # see `shadow_map.cameras`
+    corners: Corners
     object_of: list[int]  # of each surface
+    shells: device_shell.DeviceShells | None
+    gdms: device_gdm.DeviceGdms | None
+
+    def starts(self, camera: Camera) -> Iterator[tuple[int, int, list[float]]]:
+        """Yield the tetrahedra that the eye is in, their surfaces, and its texture coordinates there."""
+        for placed in self.world.shells if camera.projection == "perspective" else ():
+            for tet, place in zip(*shell.around(placed.shell, camera.eye), strict=True):
+                yield int(tet) + placed.first_tet, placed.surface, place.tolist()
+
+    @property
+    def of_shells(self) -> "tuple[opencl.Buffer, ...]":
+        """What kernels are given of them."""
+        if self.shells is None or self.gdms is None:
+            return ()
+        return (*self.shells, self.gdms.tables, self.gdms.gdms)
 
     @property
     def mixed(self) -> bool:
@@ -387,13 +416,27 @@ def _upload(scene: Scene, options: FrameOptions, before: _OnDevice | None = None
         ambient=scene.ambient > 0,
         before=None if before is None else before.materials,
     )
+    gdms = device_gdm.upload_gdms([_dressing(m) for m in scene.surfaces], None if before is None else before.gdms)
     object_of = [i for i, o in enumerate(scene.objects) for _ in o.materials]
     same = before is not None and _are(_meshes(scene), _meshes(before.scene)) and object_of == before.object_of
     if before is not None and same:
-        return before._replace(scene=scene, materials=materials)
+        return before._replace(scene=scene, materials=materials, gdms=gdms)
     world = assemble(scene)
-    corners = shadow_map.corners_of(world)
-    return _OnDevice(scene, world, device.upload_geometry(world), materials, corners, object_of)
+    corners = corners_of(world)
+    shells = None
+    if world.shells:
+        shells = device_shell.upload_shells([(s.shell, s.mesh, s.first_vertex) for s in world.shells])
+    return _OnDevice(
+        scene, world, device.upload_geometry(world), materials, corners, object_of, shells, gdms if shells else None
+    )
+
+
+def _dressing(material: Material) -> device_gdm.Dressing | None:
+    if material.gdm is None:
+        return None
+    return device_gdm.Dressing(
+        material.gdm, material.gdm.h, material.shell.queries, material.shell.base == "solid", material.albedo
+    )
 
 
 @dataclass(eq=False, kw_only=True)
@@ -448,7 +491,8 @@ class _Picture:
 
 
 def _meshes(scene: Scene) -> list[object]:
-    return [x for o in scene.objects for x in (o.mesh, o.part)]
+    shells = [x for m in scene.surfaces for x in (m.gdm, m.shell)]
+    return [x for o in scene.objects for x in (o.mesh, o.part)] + shells
 
 
 def _depths(scene: Scene) -> list[object]:
@@ -488,4 +532,7 @@ def _named(counts: dict[str, int], camera: Camera) -> dict[str, int]:
         "triangles turned away": counts["turned"],
         "losing fragments not shaded": counts["losers"],
         "shadow tests of what leans away": counts["averted"],
+        "prisms passed": counts["prisms"],
+        "tetrahedra passed": counts["tets"],
+        "rays lost in a shell": counts["endless"],
     }

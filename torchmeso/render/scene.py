@@ -4,19 +4,21 @@ Test: tests/render/test_scene.py
 """
 
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchmeso.data.btf import Evaluable
+from torchmeso.data.gdm import Gdm
 from torchmeso.errors import ConfigError, check_range, check_shape
-from torchmeso.geometry import frames
+from torchmeso.geometry import components, frames, shell
 from torchmeso.geometry.camera import Camera
 from torchmeso.geometry.frames import Frame
 from torchmeso.geometry.light import DirectionalLight, Light
 from torchmeso.geometry.mesh import FAR, Mesh
+from torchmeso.geometry.shell import BOTTOM, Shell, Side
 from torchmeso.render.rasterize import Layers, barycentric
 
 
@@ -48,6 +50,29 @@ class DistanceFunction(Protocol):
         ...
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ShellOptions:
+    """How a shell of prisms carries a GDM.
+
+    Attributes:
+        side: "inward": the mesh is the top of the shell; "outward": the bottom, as in wang2004gdm.
+        base: "solid": a floor below the material; "open": rays go through, and come in again on the far side.
+        queries: look-ups per prism; 1 is the paper's.
+    """
+
+    side: Side = "inward"
+    base: Literal["solid", "open"] = "solid"
+    queries: int = 1
+
+    def __post_init__(self) -> None:
+        """Raise ConfigError for words and numbers that mean nothing."""
+        if self.side not in ("inward", "outward"):
+            raise ConfigError(f"shell.side: expected 'inward' or 'outward', got '{self.side}'")
+        if self.base not in ("solid", "open"):
+            raise ConfigError(f"shell.base: expected 'solid' or 'open', got '{self.base}'")
+        check_range("shell.queries", self.queries, 1, 64)
+
+
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Material:
     """How a surface looks.
@@ -55,12 +80,22 @@ class Material:
     Attributes:
         btf: reflectance with meso-scale detail, or None for a plain diffuse surface.
         mdf: depth of the mesostructure, or None: no silhouette detail, and shadows fall on the mesh itself.
-        albedo: (3,) linear RGB of a plain surface; unused with a BTF.
+        albedo: (3,) linear RGB of a plain surface, and of the floor below a GDM; unused with a BTF.
+        gdm: mesostructure of any form, in a shell in place of the surface, or None. A material that has one has
+            neither BTF nor MDF.
+        shell: how the GDM is carried.
     """
 
     btf: Evaluable | None = None
     mdf: DistanceFunction | None = None
     albedo: tuple[float, float, float] = (0.6, 0.6, 0.6)
+    gdm: Gdm | None = None
+    shell: ShellOptions = ShellOptions()
+
+    def __post_init__(self) -> None:
+        """Raise ConfigError for a material of two kinds."""
+        if self.gdm is not None and (self.btf is not None or self.mdf is not None):
+            raise ConfigError("material: expected a GDM alone, or a BTF and an MDF, got both; name two materials")
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -150,8 +185,26 @@ def _in_double(x: Any) -> Any:
     return x
 
 
+class PlacedShell(NamedTuple):
+    """The shell of a surface with a GDM.
+
+    Attributes:
+        shell: its prisms.
+        mesh: the mesh it stands on.
+        surface: see `Scene.surfaces`.
+        first_vertex: of the mesh's in the world.
+        first_tet: of the shell's among those of all shells.
+    """
+
+    shell: Shell
+    mesh: Mesh
+    surface: int
+    first_vertex: int
+    first_tet: int
+
+
 class World(NamedTuple):
-    """All meshes of a scene as one.
+    """All meshes of a scene as one; in place of faces with a GDM, those that rays come into its shell by.
 
     Attributes:
         vertices: (V, 3).
@@ -166,6 +219,8 @@ class World(NamedTuple):
         owner: (F,) surface each face belongs to: its object's material, see `Scene.surfaces`.
         object: (surface,) object each surface belongs to.
         origin: (3,) float64 where the vertices' origin lies in the world.
+        entry: (F,) 4 tetrahedron + corner opposite, of faces that let rays into a shell; -1 of others.
+        shells: of all surfaces that have a GDM.
     """
 
     vertices: Float[Tensor, "V 3"]
@@ -180,6 +235,8 @@ class World(NamedTuple):
     owner: Int[Tensor, "F"]
     object: Int[Tensor, "surface"]
     origin: Float[Tensor, "3"]
+    entry: Int[Tensor, "F"]
+    shells: tuple[PlacedShell, ...]
 
     def seen_by(self, camera: Camera) -> Camera:
         """Return `camera` as it stands to the vertices."""
@@ -229,26 +286,61 @@ def assemble(scene: Scene) -> World:
     are as sharp there as at home.
     """
     meshes = [o.mesh for o in scene.objects]
-    first_vertex, first_component, faces, component = 0, 0, [], []
-    for m in meshes:
-        faces.append(m.faces + first_vertex)
-        component.append(m.component + first_component)
-        first_vertex += len(m.vertices)
-        first_component += len(m.closed)
-    owner, objects = [], []
+    vertices, origin = _at_home(torch.cat([m.vertices for m in meshes]), meshes[0].normals.dtype)
+    corners = [(vertices, *(torch.cat([getattr(m, x) for m in meshes]) for x in ATTRIBUTES))]
+    first_vertex, first_component, first_tet, next_vertex = 0, 0, 0, len(vertices)
+    faces, component, closed, owner, objects, entry, shells = [], [], [], [], [], [], []
     for i, o in enumerate(scene.objects):
-        part = torch.zeros(len(o.mesh.faces), dtype=torch.long) if o.part is None else o.part.long()
-        owner.append(part + len(objects))
+        m = o.mesh
+        part = torch.zeros(len(m.faces), dtype=torch.long) if o.part is None else o.part.long()
+        dressed = torch.tensor([x.gdm is not None for x in o.materials])[part]
+        still_closed = m.closed.clone()
+        still_closed[m.component[dressed]] = False
+        faces.append(m.faces[~dressed] + first_vertex)
+        component.append(m.component[~dressed] + first_component)
+        owner.append(part[~dressed] + len(objects))
+        entry.append(torch.full((int((~dressed).sum()),), -1))
+        closed.append(still_closed)
+        first_component += len(m.closed)
+        moved = replace(m, vertices=vertices[first_vertex : first_vertex + len(m.vertices)])
+        for k, material in enumerate(o.materials):
+            if material.gdm is None or not bool((part == k).any()):
+                continue
+            which = part == k
+            base = replace(moved, faces=m.faces[which], component=m.component[which])
+            own = shell.build(base, material.gdm.h, side=material.shell.side)
+            rim = shell.boundary(own, base="open")
+            solid = (rim.kind == BOTTOM) & (material.shell.base == "solid")
+            corners.append((own.vertices.to(vertices.dtype), *_of_columns(base, len(own.vertices))))
+            faces.append(rim.faces + next_vertex)
+            component.append(torch.full_like(rim.tet, first_component))
+            owner.append(torch.full_like(rim.tet, len(objects) + k))
+            entry.append(torch.where(solid, -1, 4 * (rim.tet + first_tet) + rim.corner))
+            closed.append(torch.tensor([False]))
+            shells.append(PlacedShell(own, base, len(objects) + k, first_vertex, first_tet))
+            first_component += 1
+            first_tet += len(own.tets)
+            next_vertex += len(own.vertices)
+        first_vertex += len(m.vertices)
         objects += [i] * len(o.materials)
-
-    def join(name: str) -> Tensor:
-        return torch.cat([getattr(m, name) for m in meshes])
-
-    vertices, origin = _at_home(join("vertices"), meshes[0].normals.dtype)
     return World(
-        vertices, torch.cat(faces), join("uv"), join("normals"), join("tangents"), join("sign"), join("scale"),
-        torch.cat(component), join("closed"), torch.cat(owner), torch.tensor(objects), origin,
+        vertices=torch.cat([c[0] for c in corners]), faces=torch.cat(faces),
+        **{name: torch.cat([c[k + 1] for c in corners]) for k, name in enumerate(ATTRIBUTES)},
+        component=torch.cat(component), closed=torch.cat(closed), owner=torch.cat(owner),
+        object=torch.tensor(objects), origin=origin, entry=torch.cat(entry), shells=tuple(shells),
     )  # fmt: skip
+
+
+ATTRIBUTES = ("uv", "normals", "tangents", "sign", "scale")
+"""What is interpolated over a face."""
+
+
+def _of_columns(mesh: Mesh, count: int) -> tuple[Tensor, ...]:
+    """Return the attributes of a shell's vertices, two per column: those of one of the mesh's vertices there."""
+    column = components.weld(mesh.vertices)
+    vertex = torch.zeros(count // 2, dtype=torch.long)
+    vertex[column] = torch.arange(len(column))
+    return tuple(getattr(mesh, name)[vertex].repeat_interleave(2, 0) for name in ATTRIBUTES)
 
 
 def _at_home(vertices: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:

@@ -5,11 +5,14 @@ already holds the shadows of its own mesostructure, a blocker must not shadow th
 
     closed surfaces:  shadow starts at t_b, where the ray leaves the body again
     open surfaces:    t_f + s_f h / cos(theta_l), the base of the slab (from behind, and plain ones: t_f)
+    GDMs:             where the ray meets the material; a receiver in a shell lets pass what is nearer than s h
 
 Whatever lies outside a body and behind it is behind t_b, and what lies inside (a receiver in a joint) is not: so
 closed surfaces need no bias against self-shadowing at all, however steep or coarse. The base of the slab, which the
 paper takes for them too, cuts off joints where the slab is thick against the curvature. A texel keeps its triangle:
 depth is taken where the receiver's own light ray meets that plane, not at the texel's centre.
+
+A map of the sun covers what can be shadowed (`casters`).
 
 Test: tests/render/test_shadow_map.py
 """
@@ -26,9 +29,10 @@ from torchmeso.data.mdf import MIN_COS
 from torchmeso.geometry.camera import Camera
 from torchmeso.geometry.directions import dot, normalize
 from torchmeso.geometry.light import DirectionalLight, Light, SpotLight
+from torchmeso.render.casters import Corners, corners_of, extents
 from torchmeso.render.rasterize import Triangles, depth_at, rasterize
 from torchmeso.render.scene import Scene, World, interpolate, rays
-from torchmeso.render.silhouette import Candidates, Silhouette, find_candidates, nearest
+from torchmeso.render.silhouette import Silhouette, find_candidates, nearest
 
 
 class ShadowMap(NamedTuple):
@@ -60,6 +64,9 @@ class ShadowFace(NamedTuple):
 SLOPE_BIAS, STEEPEST = 2.0, 0.03
 """Bias in texels per texel of depth that a surface falls by across one; cosines are taken no smaller than this."""
 
+FINEST = 64
+"""A map is fitted to no less than this part of the scene: a texel stays well above what float32 resolves of it."""
+
 
 def build(scene: Scene, world: World, light: Light, *, size: int, silhouette: Silhouette) -> ShadowMap:
     """Return the shadow map of `light`: size x size texels (half of that for each face of a point light)."""
@@ -68,8 +75,14 @@ def build(scene: Scene, world: World, light: Light, *, size: int, silhouette: Si
     )
 
 
-def blocked(shadow: ShadowMap, position: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
-    """Return whether the light is blocked at world positions; positions outside the map are lit."""
+def blocked(
+    shadow: ShadowMap, position: Float[Tensor, "n 3"], slack: Float[Tensor, "n"] | None = None
+) -> Bool[Tensor, "n"]:
+    """Return whether the light is blocked at world positions; positions outside the map are lit.
+
+    A blocker nearer to a position than its `slack` does not count: in a shell, the GDM itself says what shadows near
+    material casts.
+    """
     result = torch.zeros(len(position), dtype=torch.bool)
     for face in shadow.faces:
         camera = face.camera
@@ -85,7 +98,7 @@ def blocked(shadow: ShadowMap, position: Float[Tensor, "n 3"]) -> Bool[Tensor, "
         t = (position[seen] - camera.eye.to(position.dtype)).norm(dim=-1) if perspective else depth[seen]
         start = depth_at(face.triangles, camera, triangle, xy[seen])
         start = start + face.behind[row[seen] * camera.width + column[seen]]
-        result[seen] |= t > start
+        result[seen] |= t > (start if slack is None else start + slack[seen])
     return result
 
 
@@ -94,7 +107,7 @@ def _draw(scene: Scene, world: World, camera: Camera, silhouette: Silhouette) ->
     layers = rasterize(camera, world.vertices, world.faces)
     candidates, _ = find_candidates(scene, world, camera, layers, silhouette, depths=False)
     blockers = (candidates.fragment >= 0).nonzero()[:, 0]  # a light inside a solid lights that solid's surroundings
-    candidates = Candidates(*(x[blockers] for x in candidates))
+    candidates = candidates.select(blockers)
     closed = candidates.back >= 0
     surface = torch.where(closed, candidates.back, candidates.fragment)
     points = interpolate(world, layers, camera, surface)
@@ -113,7 +126,8 @@ def _draw(scene: Scene, world: World, camera: Camera, silhouette: Silhouette) ->
     h = torch.tensor(slabs, dtype=t.dtype)[points.owner]
     textured = layers.triangles.front[layers.triangle[surface]] & (silhouette != "none")
     slab = torch.where(textured, points.scale * h / cosine.clamp(min=MIN_COS), 0)
-    behind = torch.where(closed, inside, slab + bias)
+    met = candidates.prism >= 0
+    behind = torch.where(closed, inside, torch.where(met, candidates.depth - t + bias, slab + bias))
     first = nearest(candidates, t + behind)
     n_pixel = camera.width * camera.height
     triangle, offset = torch.full((n_pixel,), -1), torch.zeros(n_pixel, dtype=behind.dtype)
@@ -129,28 +143,33 @@ def sizes(light: Light, size: int) -> list[int]:
     return [max(size // 2, 1)] * 6
 
 
-def cameras(corners: Float[np.ndarray, "3 V"], light: Light, size: int) -> list[Camera]:
-    """Return the views from a light: one around all of the scene, one along a cone, or six faces of a cube.
+def cameras(corners: Corners, light: Light, size: int) -> list[Camera]:
+    """Return the views from a light: one around all that casts shadows, one along a cone, or six faces of a cube.
 
     In numpy, whose calls are short: a light may move in every frame.
 
     Args:
-        corners: (3, V) float64 vertices of the scene.
+        corners: of the scene.
         light: any.
         size: side of the map in texels; of a face of a cube, half of it.
     """
     if isinstance(light, DirectionalLight):
         axes = _axes(light.direction)
-        local = axes.numpy() @ corners
-        low, high = local.min(1), local.max(1)
-        extent = float((high - low).max()) * (1 + 4 / size) + 1e-9
-        eye = torch.from_numpy(((low + high) / 2) @ axes.numpy()) + axes[2] * extent
+        whole, cast = extents(corners, axes.numpy())
+        reach = float((whole.high - whole.low).max())
+        extent = max(float((cast.high - cast.low)[:2].max()), reach / FINEST) * (1 + 4 / size) + 1e-9
+        # Nothing is nearer to the light than the nearest of all vertices, wherever the map looks.
+        near = 1e-3 * reach + 1e-9
+        middle = (cast.low + cast.high) / 2
+        middle[2] = whole.high[2] + 2 * near
+        eye = torch.from_numpy(middle @ axes.numpy())
         return [
             Camera(eye=eye, axes=axes, projection="orthographic", view_height=extent, width=size, height=size,
-                   near=extent * 1e-3)
+                   near=near)
         ]  # fmt: skip
     eye = light.position.double()
-    near = max(1e-4 * float(np.linalg.norm(corners - eye.numpy()[:, None], axis=0).max()), 1e-9)
+    far = max(float(np.linalg.norm(x - eye.numpy()[:, None], axis=0).max()) for x in corners.sets)
+    near = max(1e-4 * far, 1e-9)
     if isinstance(light, SpotLight):
         axes = _axes(-light.axis)
         # A texel more on every side, so that the rim of the cone is covered.
@@ -165,11 +184,6 @@ def cameras(corners: Float[np.ndarray, "3 V"], light: Light, size: int) -> list[
             back[axis] = sign
             cube.append(Camera(eye=eye, axes=_axes(back), fov_deg=fov, width=side, height=side, near=near))
     return cube
-
-
-def corners_of(world: World) -> Float[np.ndarray, "3 V"]:
-    """Return the vertices as `cameras` takes them."""
-    return np.ascontiguousarray(world.vertices.double().numpy().T)
 
 
 def _axes(back: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:

@@ -18,15 +18,16 @@ Test: tests/render/test_silhouette.py
 from typing import Literal, NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchmeso.data.mdf import MIN_COS
-from torchmeso.geometry import frames
+from torchmeso.geometry import frames, shell
 from torchmeso.geometry.camera import Camera
-from torchmeso.render import curved_silhouette
+from torchmeso.geometry.shell import BOTTOM
+from torchmeso.render import curved_silhouette, gdm_trace
 from torchmeso.render.rasterize import Layers
-from torchmeso.render.scene import Points, Scene, World, interpolate, rays
+from torchmeso.render.scene import PlacedShell, Points, Scene, World, interpolate, rays
 
 Silhouette = Literal["none", "paper", "curved"]
 
@@ -54,6 +55,9 @@ class Candidates(NamedTuple):
         back: (n,) the fragment that closes the interval; -1 for open surfaces, and where nothing does.
         t: (n,) depth of the front fragment on the base surface.
         depth: (n,) t + d_f: where the mesostructure is met.
+        prism: (n,) of all shells, where a GDM is met; -1 elsewhere.
+        place: (n, 3) texture coordinates where a GDM is met.
+        floor: (n,) whether it is met at the bottom of its shell.
     """
 
     pixel: Int[Tensor, "n"]
@@ -61,6 +65,13 @@ class Candidates(NamedTuple):
     back: Int[Tensor, "n"]
     t: Float[Tensor, "n"]
     depth: Float[Tensor, "n"]
+    prism: Int[Tensor, "n"]
+    place: Float[Tensor, "n 3"]
+    floor: Bool[Tensor, "n"]
+
+    def select(self, which: Tensor) -> "Candidates":
+        """Return the candidates `which` (numbers or a mask)."""
+        return Candidates(*(x[which] for x in self))
 
 
 class Counts(NamedTuple):
@@ -134,6 +145,7 @@ def find_candidates(
             look-ups of everything that hits anyway.
     """
     found, single = find_intervals(layers, world)
+    entries, single = _entries(scene, world, layers, single)
     if depths:
         found, single = _opaque(scene, world, layers, found, single, silhouette)
     has_front, has_back = found.front >= 0, found.back >= 0
@@ -159,7 +171,74 @@ def find_candidates(
     back = torch.cat([found.back[hit], torch.full_like(single, -1)])
     t = torch.cat([t_front[hit], t_single])
     depth = torch.cat([t_front[hit] + d_front[hit], t_single + d_single])
-    return Candidates(pixel, fragment, back, t, depth), counts
+    nowhere = torch.full((len(pixel), 3), torch.nan, dtype=depth.dtype)
+    plain = Candidates(pixel, fragment, back, t, depth, torch.full_like(back, -1), nowhere, back < -1)
+    if world.shells and depths:
+        within = _from_within(scene, world, camera, layers.t.dtype)
+        plain = Candidates(*(torch.cat([a, b]) for a, b in zip(plain, within, strict=True)))
+    if len(entries):
+        met = _meet_gdms(scene, world, camera, layers, entries)
+        counts = counts._replace(carved=counts.carved + len(entries) - len(met.pixel))
+        plain = Candidates(*(torch.cat([a, b]) for a, b in zip(plain, met, strict=True)))
+    return plain, counts
+
+
+def _entries(scene: Scene, world: World, layers: Layers, single: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the fragments by which rays come into shells, and the rest: of shells, floors seen from below."""
+    if not world.shells:
+        return single[:0], single
+    face = layers.triangles.face[layers.triangle[single]]
+    dressed = torch.tensor([m.gdm is not None for m in scene.surfaces])[world.owner[face]]
+    front = layers.triangles.front[layers.triangle[single]]
+    enters = world.entry[face] >= 0
+    return single[enters & front], single[~dressed | (front & ~enters)]
+
+
+def _from_within(scene: Scene, world: World, camera: Camera, dtype: torch.dtype) -> Candidates:
+    """Return what all rays meet whose eye is inside of shells; in a parallel view every eye is taken to be outside."""
+    pixel = torch.arange(camera.width * camera.height)
+    origin, direction, _ = rays(camera, pixel, torch.float64)
+    origin, nothing = origin.expand(len(pixel), 3), torch.full_like(pixel, -1)
+    found = []
+    for placed in world.shells if camera.projection == "perspective" else ():
+        for tet, place in zip(*shell.around(placed.shell, camera.eye), strict=True):
+            entries = gdm_trace.Entries(origin, direction, tet.expand(len(pixel)), nothing, place.expand(len(pixel), 3))
+            found.append(_met(scene, placed, entries, pixel, nothing, torch.zeros(len(pixel), dtype=dtype)))
+    empty = torch.zeros(0, dtype=dtype)
+    none = Candidates(pixel[:0], pixel[:0], pixel[:0], empty, empty, pixel[:0], empty[:, None].expand(0, 3), empty > 0)
+    return Candidates(*(torch.cat(x) for x in zip(none, *found, strict=True)))
+
+
+def _met(
+    scene: Scene, placed: PlacedShell, entries: gdm_trace.Entries, pixel: Tensor, fragment: Tensor, t: Tensor
+) -> Candidates:
+    """Return where rays of one shell meet material."""
+    dressing = scene.surfaces[placed.surface]
+    traced = gdm_trace.trace(
+        placed.shell, dressing.gdm, entries, queries=dressing.shell.queries, floor=dressing.shell.base == "solid"
+    )
+    depth = torch.maximum(traced.t.to(t.dtype), t)
+    return Candidates(
+        pixel, fragment, torch.full_like(pixel, -1), t, depth, traced.prism + placed.first_tet // 3,
+        traced.place.to(t.dtype), traced.through == BOTTOM,
+    ).select(traced.hit)  # fmt: skip
+
+
+def _meet_gdms(scene: Scene, world: World, camera: Camera, layers: Layers, fragment: Tensor) -> Candidates:
+    """Return where rays meet material, that come into shells at `fragment`."""
+    found = []
+    entry = world.entry[layers.triangles.face[layers.triangle[fragment]]]
+    owner = world.owner[layers.triangles.face[layers.triangle[fragment]]]
+    for placed in world.shells:
+        mine = (owner == placed.surface).nonzero()[:, 0]
+        if len(mine) == 0:
+            continue
+        own = fragment[mine]
+        origin, direction, _ = rays(camera, layers.pixel[own], torch.float64)
+        tet, corner = entry[mine] // 4 - placed.first_tet, entry[mine] % 4
+        entries = gdm_trace.Entries(origin.expand(len(own), 3), direction, tet, corner)
+        found.append(_met(scene, placed, entries, layers.pixel[own], own, layers.t[own]))
+    return Candidates(*(torch.cat(x) for x in zip(*found, strict=True)))
 
 
 def _opaque(

@@ -1,0 +1,66 @@
+import numpy as np
+import pytest
+import torch
+
+from tests.data.test_gdm import layered
+from torchmeso.meso import bake_gdm, generators
+from torchmeso.meso.bake_gdm import GdmOptions
+from torchmeso.render import device_gdm
+from torchmeso.render.device_gdm import BRICK, LEFT, SOLID, Dressing
+
+
+@pytest.fixture(scope="module")
+def weave():
+    return bake_gdm.in_memory(generators.weave(), GdmOptions(texels=10, layers=5, n_theta=4, n_phi=6))
+
+
+def at(gdm, codes, phi, row, z, y, x):
+    """The pair of codes at a place, as kernels find it."""
+    layers, height, width = (-(-n // side) for n, side in zip(gdm.voxels, BRICK, strict=True))
+    brick = ((z // 2) * height + y // 4) * width + x // 4
+    voxel = ((z % 2) * 4 + y % 4) * 4 + x % 4
+    return codes[2 * (((phi * (gdm.directions.n_theta + 1) + row) * layers * height * width + brick) * 32 + voxel) :][
+        :2
+    ]
+
+
+def test_codes_are_those_of_the_table(weave):
+    codes = device_gdm.table_codes(weave)
+    assert len(codes) == device_gdm.table_bytes(weave)
+    rng = np.random.default_rng(1)
+    kinds = set()
+    for _ in range(400):
+        z, y, x = (int(rng.integers(n)) for n in weave.voxels)
+        row, phi = int(rng.integers(1, 4)), int(rng.integers(7))
+        got = at(weave, codes, phi, row, z, y, x)
+        for k in (0, 1):
+            ring = row + k - 1
+            expected = int(weave.distance[z, y, x, ring, phi % 6])
+            if weave.occupancy[z, y, x] > 0.5:
+                expected = SOLID
+            elif weave.left[z, y, x, ring, phi % 6]:
+                expected = LEFT
+            assert got[k] == min(expected, LEFT if expected >= SOLID else SOLID - 1)
+            kinds.add(min(expected, SOLID - 1) if expected < SOLID else expected)
+    assert {LEFT, SOLID} < kinds
+
+
+def test_matter_keeps_its_values():
+    gdm = layered(-0.2)
+    gdm.matter[4:] = 0
+    codes = device_gdm.matter_codes(gdm) / 65535
+    rows = gdm.matter.reshape(-1, 10).numpy()
+    near = rows[:, 6] > 0
+    np.testing.assert_allclose(codes[near, :3] * 2 - 1, rows[near, :3], atol=1e-4)
+    np.testing.assert_allclose(codes[near, 3:10], rows[near, 3:], atol=1e-4)
+    assert (codes[near, 10] == 1).all()
+    assert not codes[~near].any()
+
+
+def test_tables_stay_while_they_are_the_same(weave):
+    first = device_gdm.upload_gdms([Dressing(weave, weave.h), None])
+    again = device_gdm.upload_gdms([None, Dressing(weave, weave.h, queries=3)], first)
+    assert again.tables is first.tables
+    other = device_gdm.upload_gdms([Dressing(layered(-0.2), 0.4)], first)
+    assert other.tables is not first.tables
+    assert torch.is_tensor(other.sources[0].distance)

@@ -1,0 +1,16 @@
+"""The suite `gdm`: generalised displacement maps, run time against error.
+
+Test: tests/bench/test_gdm.py
+"""
+
+from torchmeso.bench import gdm_speed
+from torchmeso.bench.suite import Measurement
+
+MEASUREMENTS = [
+    Measurement("embree", gdm_speed.against_embree),
+    Measurement("fig7", gdm_speed.figure_7),
+    Measurement("backends", gdm_speed.backends),
+    Measurement("walk", gdm_speed.walk),
+    Measurement("leaks", gdm_speed.leaks),
+    Measurement("slices", gdm_speed.slices),
+]

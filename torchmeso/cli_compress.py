@@ -1,0 +1,158 @@
+"""The command `compress`: tables in, run-time models out. Heavy imports stay inside the functions (torch costs 2 s).
+
+Test: tests/test_cli.py
+"""
+
+from dataclasses import fields
+from functools import partial
+from typing import Any
+
+import click
+
+from torchmeso.console import progress, refuse_to_replace
+from torchmeso.errors import ConfigError
+
+
+@click.command()
+@click.argument("table")
+@click.option(
+    "--method",
+    default="eigen",
+    type=click.Choice(["eigen", "double-sh", "sh-pca", "transform", "ptm", "hsh"]),
+    show_default=True,
+    help="Kind of model; transform: the smallest file, to --psnr or --size; ptm and hsh: of an RTI set (.lp).",
+)
+@click.option("--psnr", type=float, help="eigen, double-sh, transform: least PSNR of the values of T, in dB.")
+@click.option("--size", help="The same: most bytes of the file without an MDF: 4MB, 300kB, 65536.")
+@click.option(
+    "--rank",
+    type=int,
+    help="eigen: components kept, at most the number of views [4]; sh-pca [16]; the most for a budget [all].",
+)
+@click.option(
+    "--light-terms",
+    type=int,
+    help="double-sh, sh-pca: coefficients over the light: 1, 4, 9, 16, 25, 36 [25]; the most for a budget [36].",
+)
+@click.option("--view-terms", type=int, help="double-sh: coefficients over the view [25]; the most for a budget [36].")
+@click.option(
+    "--energy", type=float, help="double-sh: bound of the coefficients' energy, of what the samples show [1]."
+)
+@click.option("--unbounded", is_flag=True, help="double-sh: plain least squares.")
+@click.option("--regularise", is_flag=True, help="double-sh, sh-pca: more coefficients than the directions tell apart.")
+@click.option(
+    "--domain",
+    type=click.Choice(["hemisphere_fit", "sphere_projection"]),
+    help="sh-pca: least squares at the lights, or the projection of a cube map [hemisphere_fit].",
+)
+@click.option("--ridge", type=float, help="sh-pca: how much small coefficients count beside small errors [1e-4].")
+@click.option("--training", type=int, help="sh-pca: vectors to find the components from, drawn at random [all].")
+@click.option("--terms", type=int, help="hsh: 4, 9 or 16 [9].")
+@click.option("--per-channel", is_flag=True, help="ptm: a polynomial for each channel instead of one and a colour.")
+@click.option(
+    "--storage",
+    default="uint8",
+    show_default=True,
+    type=click.Choice(["uint8", "float16", "float32", "adaptive"]),
+    help="Of maps; adaptive (eigen, double-sh): bytes with steps that follow their variance, entropy-coded.",
+)
+@click.option("--mdf", "silhouette", help="MDF table (.mdf.zarr) to pack into the model.")
+@click.option("--allow-missing", is_flag=True, help="Interpolate pictures that a folder or zip lacks.")
+@click.option("--out", required=True, help="The run-time model (.meso); of ptm .ptm, of hsh .rti.")
+@click.option("--force", is_flag=True, help="Replace an existing model.")
+def compress(
+    table: str,
+    method: str,
+    unbounded: bool,
+    silhouette: str | None,
+    allow_missing: bool,
+    out: str,
+    force: bool,
+    **options: Any,
+) -> None:
+    """Compress a BTF TABLE (.btf.zarr or .btf, a folder or zip of pictures, or an RTI set .lp) into a small model."""
+    from torchmeso.compress import stream, transform
+    from torchmeso.compress.budget import Budget
+    from torchmeso.data import journal, mdf, transform_btf
+    from torchmeso.pipeline import picture_sets
+    from torchmeso.pipeline.bake import code_hash
+
+    if method in ("ptm", "hsh"):
+        _relight(table, method, out, force, {**options, "unbounded": unbounded})
+        return
+    if not out.endswith(".meso"):
+        raise ConfigError(f"{out}: expected a name that ends in .meso")
+    refuse_to_replace(out, force)
+    depth = None if silhouette is None else mdf.load(silhouette)
+    chosen, wanted = _asked(method, unbounded, options)
+    said = out
+    with progress() as report:
+        source = picture_sets.open_btf(table, report, allow_missing=allow_missing)
+        told = partial(report, f"{method} BTF")
+        if isinstance(chosen, transform.TransformOptions):
+            packed, found = transform.fit(source, chosen, progress=told)
+            transform_btf.save(packed, out, silhouette=depth, psnr=round(found, 2))
+            said = f"{out}  PSNR {found:.1f} dB  {len(packed.codes)} of {len(packed.views)} view components"
+        elif isinstance(wanted, Budget):
+            said = _to_budget(source, chosen, wanted, options["rank"], out, depth, told)
+        else:
+            key = f"{journal.state_of(table)} {code_hash()}"
+            stream.fit(source, chosen, out, key=key, silhouette=depth, progress=told)
+    click.echo(said)
+
+
+def _asked(method: str, unbounded: bool, options: dict[str, Any]) -> tuple[Any, Any]:
+    """Return the options of the method, and the budget where one is given."""
+    from torchmeso.compress import budget, double_sh, eigen, sh_pca, transform
+
+    given = {name: value for name, value in options.items() if value is not None and value is not False}
+    kinds: dict[str, Any] = {
+        "eigen": eigen.EigenOptions,
+        "double-sh": double_sh.DoubleShOptions,
+        "sh-pca": sh_pca.ShPcaOptions,
+        "transform": transform.TransformOptions,
+    }
+    known = {field.name for field in fields(kinds[method])}
+    if method == "transform" and given["storage"] == "uint8":
+        del given["storage"]  # the default of the others
+    limits = {"psnr", "size"} if method in ("eigen", "double-sh") else set()
+    if (wrong := sorted(set(given) - known - limits)) or (unbounded and method != "double-sh"):
+        raise ConfigError(f"compress: --method {method} has no --{(wrong or ['unbounded'])[0].replace('_', '-')}")
+    if unbounded:
+        given["energy"] = None
+    if "size" in given:
+        given["size"] = budget.parse_size(given["size"])
+    limited = {name: given.pop(name) for name in limits & set(given)}
+    if not limited:
+        return kinds[method](**given), None
+    given.pop("rank", None)  # then the most of them
+    most = {"light_terms": 36, "view_terms": 36} if method == "double-sh" else {}
+    return kinds[method](**{**most, **given}), budget.Budget(**limited)
+
+
+def _to_budget(source: Any, chosen: Any, wanted: Any, most: int | None, out: str, depth: Any, told: Any) -> str:
+    """Write the model that keeps a budget; return what to say about it."""
+    from torchmeso.compress import double_sh_budget, eigen_budget
+    from torchmeso.compress.eigen import EigenOptions
+    from torchmeso.data import eigen_btf, sh_btf
+
+    coded = chosen.storage == "adaptive"
+    if isinstance(chosen, EigenOptions):
+        eigen, found = eigen_budget.fit(source, wanted, storage=chosen.storage, rank=most, progress=told)
+        eigen_btf.save(eigen, out, silhouette=depth, coded=coded, psnr=round(found, 2))
+        return f"{out}  PSNR {found:.1f} dB  rank {eigen.rank} of {len(eigen.views)}"
+    harmonic, found = double_sh_budget.fit(source, wanted, chosen, backend="auto", progress=told)
+    sh_btf.save(harmonic, out, silhouette=depth, coded=coded, psnr=round(found, 2))
+    return f"{out}  PSNR {found:.1f} dB  " + "{} x {} coefficients of light and view".format(*harmonic.terms)
+
+
+def _relight(lights: str, method: Any, out: str, force: bool, options: dict[str, Any]) -> None:
+    from torchmeso.pipeline import relight
+
+    own = {"terms", "per_channel", "storage"}  # storage has a default: it was not asked for
+    wrong = sorted(name for name, value in options.items() if name not in own and value not in (None, False))
+    if wrong:
+        raise ConfigError(f"compress: --method {method} has no --{wrong[0].replace('_', '-')}")
+    refuse_to_replace(out, force)
+    relight.fit(lights, out, method=method, terms=options["terms"], per_channel=options["per_channel"])
+    click.echo(out)
