@@ -10,7 +10,7 @@ import torch
 from tests.data import tg3
 from tests.meso.looks import looks, wrong
 from torchmeso.data import texgen
-from torchmeso.errors import ConfigError, MesoError, SizeError
+from torchmeso.errors import ConfigError, GeometryError, MesoError, SizeError
 from torchmeso.meso import bake_gdm, solid, textile
 from torchmeso.meso.bake_gdm import GdmOptions, RayCastGdm
 from torchmeso.meso.bake_mdf import RayCastMdf
@@ -114,6 +114,19 @@ def test_moving_the_domain_moves_the_tile(tmp_path, rng):
     one, other = RayCastGdm(here, 1.0).inside(place), RayCastGdm(there, 1.0).inside(moved)
     assert (one != other).float().mean() < 2e-3
     assert 0.2 < one.float().mean() < 0.6
+
+
+def test_a_yarn_far_from_its_domain_comes_home(tmp_path):
+    """Places a thousand tiles away keep their precision, and the tile is the same."""
+    section = tg3.constant(tg3.section({"type": "CSectionEllipse", "Width": 0.5, "Height": 0.25}))
+    near = [(0, 0.5, 0), (0.5, 0.5, 0.25), (1, 0.5, 0)]
+    far = [(x + 4096, y - 4096, z) for x, y, z in near]
+    repeats = [(1, 0, 0), (0, 1, 0)]
+    here, there = (
+        build(tmp_path, tg3.textile([tg3.yarn(nodes, sections=section, repeats=repeats)], ((0, 0), (1, 1))))
+        for nodes in (near, far)
+    )
+    torch.testing.assert_close(here.geometry.vertices, there.geometry.vertices, rtol=0, atol=2e-6)
 
 
 def test_the_border_is_crossed_without_a_crack(tmp_path):
@@ -228,5 +241,8 @@ def test_what_is_no_tile_is_refused(tmp_path):
         build(tmp_path, plain_weave(), along=1)
     with pytest.raises(SizeError, match=r"textile: needs .*lower along or segments"):
         build(tmp_path, plain_weave(), along=4096, segments=4096)
+    long = tg3.yarn([(0, 0.5, 0), (40.5, 0.5, 0)], periodic=0)
+    with pytest.raises(GeometryError, match="yarns that reach over at most 32 tiles, got a longer one"):
+        build(tmp_path, tg3.textile([long], ((0, 0), (1, 1))), along=4)
     with pytest.raises(ConfigError, match=r"textile\.h: expected a value from 0\.3 to 10, got 0\.1"):
         build(tmp_path, plain_weave(), h=0.1)

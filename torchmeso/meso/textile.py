@@ -16,13 +16,16 @@ from torch import Tensor
 
 from torchmeso.data import texgen
 from torchmeso.data.textile import Textile
-from torchmeso.errors import check_memory, check_range
+from torchmeso.errors import GeometryError, check_memory, check_range
 from torchmeso.meso.mesostructure import Mesostructure, Rgb, palette
 from torchmeso.meso.parts import DARK, Triangles, assemble, floor, tube
 from torchmeso.meso.textile_period import copies, goes_on, tile_of
 
 STEPS = 1 << 20
 """Vertices lie on a grid of this many steps per tile, so that moving by whole tiles is exact."""
+
+MOST_TILES = 32
+"""How far one yarn may reach."""
 
 MEMORY_LIMIT = 2 << 30
 
@@ -91,7 +94,7 @@ def from_textile(
         segments: facets around a yarn.
 
     Raises:
-        GeometryError: there is no period that makes a tile.
+        GeometryError: there is no period that makes a tile, or a yarn reaches over too many.
         ConfigError: the yarns are deeper than `h`, or a dial is out of range.
         SizeError: the tile would have too many triangles.
     """
@@ -110,7 +113,11 @@ def from_textile(
     found: list[tuple[Float[Tensor, "ring around 3"], bool, int]] = []
     for k, yarn in enumerate(textile.yarns):
         rings = (yarn.rings(step, segments) - torch.nn.functional.pad(tile.low, (0, 1))) / tile.unit
-        found += [(rings + shift, goes_on(yarn, tile), k) for shift in shifts[k]]
+        if float((rings.amax((0, 1)) - rings.amin((0, 1)))[:2].max()) > MOST_TILES:
+            raise GeometryError(f"textile: expected yarns that reach over at most {MOST_TILES} tiles, got a longer one")
+        for shift in shifts[k]:
+            home = torch.nn.functional.pad((rings[0, 0] + shift)[:2].floor(), (0, 1))
+            found.append((rings + shift - home, goes_on(yarn, tile), k))
     top = max(float(rings[..., 2].max()) for rings, _, _ in found)
     parts = []
     for rings, open_ended, k in found:

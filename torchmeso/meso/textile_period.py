@@ -69,7 +69,7 @@ def tile_of(textile: Textile) -> Tile:
 
 
 def copies(yarn: Yarn, tile: Tile) -> list[Float[Tensor, "3"]]:
-    """Return the shifts (tile units) of all copies of a yarn that begin in the tile.
+    """Return the shifts (tile units, in [0, 1)) of all copies of a yarn that the tile holds.
 
     Raises:
         GeometryError: the repeats do not fill the tile evenly, or the yarn lies in its own copies.
