@@ -4,7 +4,8 @@ wang2004gdm, section 3.1. A sample is one of three cases: a hit at distance d; `
 its top or bottom (or meets nothing within `cap`) and the distance there is known without a table; inside solid, d = 0.
 The three never mix: a query decides by weight which case it is, and averages over the samples of that case alone.
 A sample's distance is carried along the ray to the point asked about, d_i + (p_i - p) . w, which is exact before a
-plane however many of the eight corners lie inside solid. Corners inside solid that lie ahead count as hits; those
+plane however many of the eight corners lie inside solid; distances that lie far apart are of two surfaces, and only the
+larger share of them counts. Corners inside solid that lie ahead count as hits; those
 behind, as of a ray that leaves a surface, do not count.
 
 Test: tests/data/test_gdm.py
@@ -26,6 +27,10 @@ from torchmeso.geometry.sphere import SphereGrid
 
 LEVEL = 1e-12
 """Rays that climb by less per unit of way never leave the slab."""
+
+
+APART = 4.0
+"""Voxels between distances that are not of one surface."""
 
 
 class Query(NamedTuple):
@@ -103,6 +108,12 @@ class Gdm:
         return z, height, width
 
     @property
+    def voxel(self) -> float:
+        """The longest side of a voxel, tile units."""
+        layers, height, width = self.voxels
+        return max(1 / width, 1 / height, self.h / (layers - 1))
+
+    @property
     def directions(self) -> SphereGrid:
         """The directions of travel."""
         return SphereGrid(n_theta=self.distance.shape[3], n_phi=self.distance.shape[4])
@@ -130,7 +141,7 @@ class Gdm:
         found = tables.distance.flatten()[index].to(share.dtype)
         if self.distance.dtype == torch.uint8:
             found = found * (self.cap / 255)
-        carried = (share * met * (found + ahead.unsqueeze(-1)).flatten(-2)).sum(-1) / hits.clamp(min=1e-12)
+        carried = self._of_one_surface((found + ahead.unsqueeze(-1)).flatten(-2), share * met, hits)
         # A ray towards corners inside solid meets something, though its neighbours that start outside may pass.
         before = weight * solid * (ahead > 0)
         blocks = before.sum(-1)
@@ -142,6 +153,17 @@ class Gdm:
         near = torch.minimum(distance.clamp(min=0), end)
         distance = torch.where(inside, 0, torch.where(left, end, near))
         return Query(distance, left, torch.where(hits > 1e-6, near, torch.inf))
+
+    def _of_one_surface(self, carried: Tensor, share: Tensor, hits: Tensor) -> Tensor:
+        """Return the mean of distances; where they are of two surfaces, far apart, that of the larger share."""
+        total = (share * carried).sum(-1)
+        mean = total / hits.clamp(min=1e-12)
+        near = share * (carried <= mean.unsqueeze(-1))
+        nearer, before = near.sum(-1), (near * carried).sum(-1)
+        farther = hits - nearer
+        first, second = before / nearer.clamp(min=1e-12), (total - before) / farther.clamp(min=1e-12)
+        two = (second - first > APART * self.voxel) & (nearer > 1e-6) & (farther > 1e-6)
+        return torch.where(two, torch.where(nearer >= farther, first, second), mean)
 
     def boundary(self, place: Float[Tensor, "*batch 3"], w: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         """Return the way along `w` to the top or bottom of the slab, at most `cap`."""

@@ -148,11 +148,9 @@ def in_shade(
     deeper, because a distance is interpolated, once more from farther out. Where there is a `floor` light from below
     does not get through.
     """
-    layers, height, width = gdm.voxels
-    voxel = max(1 / width, 1 / height, gdm.h / (layers - 1))
-    blocked, within = _asked(gdm, place + voxel * normal, wi)
+    blocked, within = _asked(gdm, place + gdm.voxel * normal, wi)
     if bool(within.any()):
-        blocked[within] = _asked(gdm, (place + DEEPER * voxel * normal)[within], wi[within])[0]
+        blocked[within] = _asked(gdm, (place + DEEPER * gdm.voxel * normal)[within], wi[within])[0]
     return blocked | (wi[:, 2] <= 0) if floor else blocked
 
 

@@ -258,22 +258,20 @@ def _meet(
     if gdm is None or not len(start):
         return met, length, near, sunk
     active, asked = torch.arange(len(start)), 0
-    layers, height, width = gdm.voxels
-    voxel = max(1 / width, 1 / height, gdm.h / (layers - 1))
     while len(active):
         found = gdm.evaluate(start[active] + d[active, None] * v[active], v[active])
         reach = d[active] + found.distance
         near[active] = d[active] + found.near
         asked += 1
         beyond = reach > length[active] + TIE
-        last = (found.distance < voxel) | (asked >= queries)
+        last = (found.distance < gdm.voxel) | (asked >= queries)
         stops = ~found.left & ~beyond & last
         met[active[stops]] = True
         if asked == 1:
             sunk = met & (found.distance <= 0)
         # Asked again a voxel before the material, where the table is at its best; and where the table ends before the
         # way does, from there on, whatever the number of queries.
-        step = torch.where(found.left | last, found.distance, found.distance - voxel)
+        step = torch.where(found.left | last, found.distance, found.distance - gdm.voxel)
         d[active] = torch.minimum(d[active] + step, length[active])
         active = active[~stops & ~beyond & (found.distance > 1e-9)]
     return met, d, near, sunk
