@@ -203,6 +203,14 @@ static void draw_stamp(const Place *place, const Target *target, const Rays *ray
     const float16 d = from_bits(shaded) ? seen->depth.vector : (float16)0.0f;
     const Vector3 receiver = {rays->origin.x + d * rays->direction.x, rays->origin.y + d * rays->direction.y,
                               rays->origin.z + d * rays->direction.z};
+    const Vector3 sunk = {receiver.x - seen->position.x, receiver.y - seen->position.y, receiver.z - seen->position.z};
+    const float16 way = root(dot3(sunk, sunk));
+#ifdef GDM
+    const int16 below = from_bits(shaded & ~seen->met) & (way > 0.0f);
+#else
+    const int16 below = from_bits(shaded) & (way > 0.0f);
+#endif
+    const float16 reach = below ? 2.0f * way : (float16)INFINITY;
     for (int i = 0; i < frame->lights; i++) {
         int asked = place->skips & SKIP_FACING && !(frame->outputs & OWNER)
                   ? facing(lights + i, &seen->at.n, &seen->position, shaded) : shaded;
@@ -214,7 +222,13 @@ static void draw_stamp(const Place *place, const Target *target, const Rays *ray
         tally->averted += __builtin_popcount(shaded & ~asked);
         const int first = lights[i].first_face, count = lights[i].faces;
 #ifdef SHADOWS
-        blocked[i] = asked ? blocked_from(place, &target->shadows, first, count, &receiver, slack, asked) : 0;
+        int deep = 0;
+        blocked[i] = asked ? blocked_from(place, &target->shadows, first, count, &receiver, slack, reach, asked, &deep)
+                           : 0;
+        deep &= ~blocked[i];
+        if (deep)  // what a body's crease has swallowed is as dark as the surface above it
+            blocked[i] |= blocked_from(place, &target->shadows, first, count, &seen->position, slack,
+                                       (float16)INFINITY, deep, &deep);
 #else
         blocked[i] = 0;
 #endif

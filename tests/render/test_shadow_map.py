@@ -176,3 +176,15 @@ def test_mesostructured_plane_is_lit_all_over():
     )
     picture = render(subject, camera((0, 3, 2), fov_deg=35), FrameOptions(shadow_map_size=256))
     assert not picture.shadowed.any()
+
+
+def test_a_point_sunk_beyond_a_crease_is_as_dark_as_its_surface():
+    """Inside of a ring, close to where light passes it by: what lies a little deeper lies where the ring has no gap."""
+    subject, light = scene(shapes.torus(tube=0.3, triangles=20_000)), sun(1, 0, 0)
+    world = assemble(subject)
+    shadow = shadow_map.build(subject, world, light, size=512, silhouette="curved")
+    surface = torch.tensor([[-0.118, 0, 0.69], [1.083, 0, 0.72]])  # behind the gap; on the side of the light
+    sunk = torch.tensor([[-0.12, 0, 0.72], [1.06, 0, 0.72]])
+    assert shadow_map.blocked(shadow, surface).tolist() == [True, False]
+    assert shadow_map.blocked(shadow, sunk).tolist() == [False, False]
+    assert shadow_map.blocked(shadow, sunk, surface=surface).tolist() == [True, False]

@@ -150,7 +150,7 @@ def _develop(
     points = interpolate(world, layers, camera, plain.fragment)
     owner[plain.pixel] = world.object[points.owner]
     origin, direction, _ = rays(camera, plain.pixel, dtype)
-    dark = _blocked(scene, maps, origin + plain.depth[:, None] * direction)
+    dark = _blocked(scene, maps, origin + plain.depth[:, None] * direction, surface=points.position)
     shadowed[:, plain.pixel] = dark
     samples = options.antialias if options.filtering else None
     rgb[plain.pixel] = shade(scene, points, -direction, dark, samples=samples)
@@ -173,11 +173,17 @@ def _develop(
     }
 
 
-def _blocked(scene: Scene, maps: list[shadow_map.ShadowMap], position: Tensor, slack: Tensor | None = None) -> Tensor:
-    """Return whether each light is blocked at positions."""
+def _blocked(
+    scene: Scene,
+    maps: list[shadow_map.ShadowMap],
+    position: Tensor,
+    slack: Tensor | None = None,
+    surface: Tensor | None = None,
+) -> Tensor:
+    """Return whether each light is blocked at positions; see `shadow_map.blocked`."""
     dark = torch.zeros(len(scene.lights), len(position), dtype=torch.bool)
     for l, shadow in enumerate(maps):
-        dark[l] = shadow_map.blocked(shadow, position, slack)
+        dark[l] = shadow_map.blocked(shadow, position, slack, surface=surface)
     return dark
 
 

@@ -280,7 +280,7 @@ class Renderer:
         # Empty from the start: where layers find no room a tile stays as it was, and the frame is drawn again.
         stored = (
             opencl.upload(np.zeros((stamps, 2), np.int32)), opencl.allocate(64 * room), opencl.allocate(64 * room),
-            opencl.allocate(128 * stamps),
+            opencl.allocate(192 * stamps),
         )  # fmt: skip
         faces = [len(of_light) for of_light in sizes]
         maps = _Maps(views=self._views(len(sides)), stored=stored, room=room, sizes=sizes, faces=faces)

@@ -52,12 +52,14 @@ class ShadowFace(NamedTuple):
         camera: the view.
         triangle: (pixels,) row of `triangles` on which the nearest shadow starts, -1 = none.
         behind: (pixels,) distance from that triangle's plane to where the shadow starts.
+        length: (pixels,) way of the light through the closed body whose back that is; 0 = another surface.
         triangles: what was drawn.
     """
 
     camera: Camera
     triangle: Tensor
     behind: Tensor
+    length: Tensor
     triangles: Triangles
 
 
@@ -76,14 +78,23 @@ def build(scene: Scene, world: World, light: Light, *, size: int, silhouette: Si
 
 
 def blocked(
-    shadow: ShadowMap, position: Float[Tensor, "n 3"], slack: Float[Tensor, "n"] | None = None
+    shadow: ShadowMap,
+    position: Float[Tensor, "n 3"],
+    slack: Float[Tensor, "n"] | None = None,
+    *,
+    surface: Float[Tensor, "n 3"] | None = None,
 ) -> Bool[Tensor, "n"]:
     """Return whether the light is blocked at world positions; positions outside the map are lit.
 
     A blocker nearer to a position than its `slack` does not count: in a shell, the GDM itself says what shadows near
     material casts.
+
+    A position in a body deeper than twice its way from the `surface` it is seen through did not get there from that
+    surface's outside: in a crease it has come to lie where the map shows no gap any more. Then the surface decides.
     """
     result = torch.zeros(len(position), dtype=torch.bool)
+    deep = torch.zeros_like(result)
+    way = torch.zeros(len(position)) if surface is None else (position - surface).norm(dim=-1)
     for face in shadow.faces:
         camera = face.camera
         x_w, y_w, w, depth = camera.project(position).unbind(-1)
@@ -97,8 +108,16 @@ def blocked(
         perspective = camera.projection == "perspective"
         t = (position[seen] - camera.eye.to(position.dtype)).norm(dim=-1) if perspective else depth[seen]
         start = depth_at(face.triangles, camera, triangle, xy[seen])
-        start = start + face.behind[row[seen] * camera.width + column[seen]]
+        texel = row[seen] * camera.width + column[seen]
+        behind, length = face.behind[texel], face.length[texel]
+        front = start - length - behind  # later by the bias: between centres of texels it is not known better
+        deep[seen] |= (length > 0) & (way[seen] > 0) & (t > front + 2 * way[seen])
+        start = start + behind
         result[seen] |= t > (start if slack is None else start + slack[seen])
+    if surface is None:
+        return result
+    asked = (deep & ~result).nonzero()[:, 0]
+    result[asked] = blocked(shadow, surface[asked])
     return result
 
 
@@ -130,10 +149,12 @@ def _draw(scene: Scene, world: World, camera: Camera, silhouette: Silhouette) ->
     behind = torch.where(closed, inside, torch.where(met, candidates.depth - t + bias, slab + bias))
     first = nearest(candidates, t + behind)
     n_pixel = camera.width * camera.height
-    triangle, offset = torch.full((n_pixel,), -1), torch.zeros(n_pixel, dtype=behind.dtype)
+    triangle = torch.full((n_pixel,), -1)
+    offset, length = torch.zeros(2, n_pixel, dtype=behind.dtype)
     triangle[candidates.pixel[first]] = layers.triangle[surface[first]]
     offset[candidates.pixel[first]] = behind[first]
-    return ShadowFace(camera, triangle, offset, layers.triangles)
+    length[candidates.pixel[first]] = torch.where(closed, t - candidates.t, 0)[first]
+    return ShadowFace(camera, triangle, offset, length, layers.triangles)
 
 
 def sizes(light: Light, size: int) -> list[int]:
