@@ -90,6 +90,10 @@ def test_from_a_mesostructure_to_a_model(tmp_path):
     assert "PSNR when fitted (dB): 35." in run("info", model).stdout
     assert isinstance(open_model(model, rank=2).btf, EigenBtf)
     assert run("compress", btf_path, "--method", "transform", "--size", "40kB", *budget[4:]).exit_code == 0
+    factored = ("--method", "factored", "--rank", 3, "--colour", "log-y", *budget[4:])
+    assert "opens as an eigen BTF of rank " in run("compress", btf_path, *factored).stdout
+    assert "colour model: 11 (log Y, U/Y, V/Y)" in run("info", model).stdout
+    assert isinstance(open_model(model, rank=2).btf, EigenBtf)
     for storage in ("uint8", "adaptive"):
         asked = ("--method", "eigen", "--psnr", 30, "--storage", storage, *budget[4:])
         said = run("compress", btf_path, *asked).stdout
@@ -170,6 +174,7 @@ REFUSED = [
     (["compress", "a", "--method", "transform", "--size", "big", "--out", "x.meso"], "a size like 4MB"),
     (["compress", "a", "--method", "transform", "--energy", "2", "--out", "x.meso"], "transform has no --energy"),
     (["compress", "a", "--method", "sh-pca", "--psnr", "38", "--out", "x.meso"], "--method sh-pca has no --psnr"),
+    (["compress", "a", "--colour", "yuv", "--out", "x.meso"], "--method eigen has no --colour"),
     (["compress", "a", "--psnr", "38", "--size", "4MB", "--out", "x.meso"], "--psnr or --size, and not both"),
     (["compress", "a", "--method", "sh-pca", "--storage", "adaptive", "--out", "x.meso"], "has no adaptive steps"),
     (["compress", "a", "--unbounded", "--out", "x.meso"], "--method eigen has no --unbounded"),

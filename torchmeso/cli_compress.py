@@ -18,16 +18,17 @@ from torchmeso.errors import ConfigError
 @click.option(
     "--method",
     default="eigen",
-    type=click.Choice(["eigen", "double-sh", "sh-pca", "transform", "ptm", "hsh"]),
+    type=click.Choice(["eigen", "double-sh", "sh-pca", "transform", "factored", "ptm", "hsh"]),
     show_default=True,
-    help="Kind of model; transform: the smallest file, to --psnr or --size; ptm and hsh: of an RTI set (.lp).",
+    help="Kind of model; transform: the smallest file, to --psnr or --size; factored: as Bonn's DFMF; "
+    "ptm and hsh: of an RTI set (.lp).",
 )
 @click.option("--psnr", type=float, help="eigen, double-sh, transform: least PSNR of the values of T, in dB.")
 @click.option("--size", help="The same: most bytes of the file without an MDF: 4MB, 300kB, 65536.")
 @click.option(
     "--rank",
     type=int,
-    help="eigen: components kept, at most the number of views [4]; sh-pca [16]; the most for a budget [all].",
+    help="eigen: components kept, at most the number of views [4]; sh-pca, factored [16]; the most for a budget [all].",
 )
 @click.option(
     "--light-terms",
@@ -47,6 +48,11 @@ from torchmeso.errors import ConfigError
 )
 @click.option("--ridge", type=float, help="sh-pca: how much small coefficients count beside small errors [1e-4].")
 @click.option("--training", type=int, help="sh-pca: vectors to find the components from, drawn at random [all].")
+@click.option(
+    "--colour",
+    type=click.Choice(["rgb", "yuv", "log-y"]),
+    help="factored: what has factors of its own; log-y: log Y, U/Y and V/Y [rgb].",
+)
 @click.option("--terms", type=int, help="hsh: 4, 9 or 16 [9].")
 @click.option("--per-channel", is_flag=True, help="ptm: a polynomial for each channel instead of one and a colour.")
 @click.option(
@@ -71,9 +77,9 @@ def compress(
     **options: Any,
 ) -> None:
     """Compress a BTF TABLE (.btf.zarr or .btf, a folder or zip of pictures, or an RTI set .lp) into a small model."""
-    from torchmeso.compress import stream, transform
+    from torchmeso.compress import factored, stream, transform
     from torchmeso.compress.budget import Budget
-    from torchmeso.data import journal, mdf, transform_btf
+    from torchmeso.data import factored_btf, journal, mdf, transform_btf
     from torchmeso.pipeline import picture_sets
     from torchmeso.pipeline.bake import code_hash
 
@@ -93,6 +99,10 @@ def compress(
             packed, found = transform.fit(source, chosen, progress=told)
             transform_btf.save(packed, out, silhouette=depth, psnr=round(found, 2))
             said = f"{out}  PSNR {found:.1f} dB  {len(packed.codes)} of {len(packed.views)} view components"
+        elif isinstance(chosen, factored.FactoredOptions):
+            factors = factored.fit(source, chosen, progress=told)
+            factored_btf.save(factors, out, silhouette=depth)
+            said = f"{out}  opens as an eigen BTF of rank {factors.opened_rank}"
         elif isinstance(wanted, Budget):
             said = _to_budget(source, chosen, wanted, options["rank"], out, depth, told)
         else:
@@ -103,7 +113,7 @@ def compress(
 
 def _asked(method: str, unbounded: bool, options: dict[str, Any]) -> tuple[Any, Any]:
     """Return the options of the method, and the budget where one is given."""
-    from torchmeso.compress import budget, double_sh, eigen, sh_pca, transform
+    from torchmeso.compress import budget, double_sh, eigen, factored, sh_pca, transform
 
     given = {name: value for name, value in options.items() if value is not None and value is not False}
     kinds: dict[str, Any] = {
@@ -111,9 +121,10 @@ def _asked(method: str, unbounded: bool, options: dict[str, Any]) -> tuple[Any, 
         "double-sh": double_sh.DoubleShOptions,
         "sh-pca": sh_pca.ShPcaOptions,
         "transform": transform.TransformOptions,
+        "factored": factored.FactoredOptions,
     }
     known = {field.name for field in fields(kinds[method])}
-    if method == "transform" and given["storage"] == "uint8":
+    if method in ("transform", "factored") and given["storage"] == "uint8":
         del given["storage"]  # the default of the others
     limits = {"psnr", "size"} if method in ("eigen", "double-sh") else set()
     if (wrong := sorted(set(given) - known - limits)) or (unbounded and method != "double-sh"):

@@ -8,7 +8,7 @@ from torchmeso.compress.double_sh import DoubleShOptions
 from torchmeso.compress.sh_pca import ShPcaOptions
 from torchmeso.data import store
 from torchmeso.errors import ConfigError, FormatError
-from torchmeso.pipeline import bake
+from torchmeso.pipeline import bake, render
 
 
 def test_bakes_what_is_used_and_nothing_else(cache):
@@ -54,6 +54,28 @@ def test_double_sh_instead_of_eigen(cache):
     assert found.btf.terms == (4, 4)
     assert found.mdf is not None
     assert bake.open_model(bake.model_path(brick), rank=1).btf.terms == (1, 1)
+
+
+@pytest.mark.parametrize("kind", ["eigen", "double_sh"])
+def test_adaptive_models_are_smaller_and_drawn_like_the_others(kind, tmp_path):
+    """In torch and in the OpenCL frame, where there is one: the picture is the one of eight bits within the budget."""
+    pictures, size = {}, {}
+    for storage in ("uint8", "adaptive"):
+        options = {
+            "eigen": {"rank": 3, "storage": storage},
+            "double_sh": {"light_terms": 4, "view_terms": 4, "storage": storage},
+        }
+        brick = {k: v for k, v in small().materials["brick"].model_dump().items() if k in ("btf", "mdf")}
+        content = {"brick": {"meso": {"type": "brick"}, **brick, kind: options[kind]}, "clay": {"albedo": [1, 1, 1]}}
+        settings = small(materials=content)
+        size[storage] = bake.prepare(settings)["brick"].model_bytes
+        for backend in ("torch", "auto"):
+            found = render.render(settings.model_copy(update={"backend": backend})).picture
+            pictures[storage, backend] = found.rgb
+    assert size["adaptive"] < size["uint8"]
+    for backend in ("torch", "auto"):
+        assert (pictures["adaptive", backend] - pictures["uint8", backend]).square().mean().sqrt() < 0.02
+    torch.testing.assert_close(pictures["adaptive", "auto"], pictures["adaptive", "torch"], rtol=0, atol=0.02)
 
 
 def test_sh_pca_instead_of_eigen(cache):

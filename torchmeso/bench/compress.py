@@ -294,6 +294,7 @@ MEASUREMENTS = (
     Measurement("compress.sh_pca", sh_pca.rows),
     Measurement("compress.budget", rates.budgets),
     Measurement("compress.adaptive", rates.adaptive),
+    Measurement("compress.factored", rates.factorised),
     Measurement("compress.decode", rates.decoding),
     Measurement("compress.sh", harmonics.basis),
     Measurement("compress.rotation", harmonics.rotation),

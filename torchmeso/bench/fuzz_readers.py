@@ -20,17 +20,19 @@ import torch
 from torchmeso.bench import fuzz
 from torchmeso.bench.fuzz import Kind, damaged_bytes
 from torchmeso.bench.suite import Context, Measurement, Row, resident_peak
-from torchmeso.compress import dfmf, double_sh, eigen, transform
+from torchmeso.compress import dfmf, double_sh, eigen, factored, transform
 from torchmeso.compress import rti as rti_fit
 from torchmeso.compress.dfmf import DfmfOptions
 from torchmeso.compress.double_sh import DoubleShOptions
 from torchmeso.compress.eigen import EigenOptions
+from torchmeso.compress.factored import FactoredOptions
 from torchmeso.compress.transform import TransformOptions
 from torchmeso.data import (
     btf_file,
     btfdbb_write,
     eigen_btf,
     exr_stack,
+    factored_btf,
     hsh,
     image,
     picture_set,
@@ -166,7 +168,7 @@ def harmonics(folder: Path) -> Files:
 
 
 def streams(folder: Path) -> Files:
-    """Run-time models whose codes are streams: transform-coded, and adaptive eigen and double SH."""
+    """Run-time models that are decoded when opened: transform-coded, adaptive eigen and double SH, factored."""
     table = _table()
     transform_btf.save(transform.fit(table, TransformOptions(psnr=30.0))[0], folder / "transform.meso")
     options = EigenOptions(rank=4, storage="adaptive")
@@ -174,11 +176,14 @@ def streams(folder: Path) -> Files:
     harmonic = double_sh.fit(table, DoubleShOptions(light_terms=4, view_terms=4, storage="adaptive"))
     sh_btf.save(harmonic, folder / "sh.meso", coded=True)
 
+    factored_btf.save(factored.fit(table, FactoredOptions(rank=3, colour="log-y")), folder / "factored.meso")
+
     def read(path: Path) -> None:
         open_model(path)
         describe.file(path)
 
-    return {name: ((folder / name).read_bytes(), read) for name in ("transform.meso", "eigen.meso", "sh.meso")}
+    names = "transform.meso", "eigen.meso", "sh.meso", "factored.meso"
+    return {name: ((folder / name).read_bytes(), read) for name in names}
 
 
 def _table() -> Btf:

@@ -9,6 +9,7 @@ Test: tests/bench/test_rate.py
 
 import math
 import tempfile
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -22,11 +23,12 @@ from torchmeso.algebra.spherical_harmonics import basis, degree_of
 from torchmeso.bench import frames
 from torchmeso.bench.suite import Context, Row
 from torchmeso.bench.timing import time_together
-from torchmeso.compress import budget, dfmf, double_sh, double_sh_budget, eigen, eigen_budget, transform
+from torchmeso.compress import budget, dfmf, double_sh, double_sh_budget, eigen, eigen_budget, factored, transform
 from torchmeso.compress.budget import Budget
 from torchmeso.compress.dfmf import DfmfOptions
 from torchmeso.compress.double_sh import DoubleShOptions
 from torchmeso.compress.eigen import EigenOptions
+from torchmeso.compress.factored import FactoredOptions
 from torchmeso.compress.transform import TransformOptions
 from torchmeso.data import btfdbb_colour, eigen_btf, sh_btf
 from torchmeso.data.btf import Btf
@@ -130,6 +132,31 @@ def adaptive(context: Context) -> Iterator[Row]:
                 value=round(eight / ours, 2), unit="x", better="higher", goal=2.0,
                 peer=f"{eight_db:.2f} dB and {ours_db:.2f} dB; {coded / ours:.2f} x where both are entropy-coded",
             )  # fmt: skip
+
+
+def factorised(context: Context) -> Iterator[Row]:
+    """One factorisation per channel as a run-time model: the eigen BTF it opens as, beside one of as many bytes."""
+    for name in MATERIALS[:1] if context.quick else MATERIALS:
+        table, T = _baked(name)
+        table, T = Btf(images=T.clamp(min=0), lights=table.lights, views=table.views), T.clamp(min=0)
+        for rank in (4, 16):
+            for colour in ("rgb", "log-y"):
+                model = factored.fit(table, FactoredOptions(rank=rank, colour=colour))
+                start = time.perf_counter()
+                opened = factored.opened(model)
+                seconds = time.perf_counter() - start
+                size = 2 * (model.by_pair.numel() + model.by_texel.numel())
+                plain = eigen.fit(table, EigenOptions(rank=max(1, size // T[:, 0].numel())))
+                decoded = budget.psnr_of(T, model.rows(0, table.texels[0]))
+                yield Row(
+                    id=f"compress.factored.{name}.{rank}.{colour}",
+                    what=f"PSNR of the eigen BTF that {rank} components of each channel ({colour}) open as, "
+                    f"baked {name}, 32 x 32 texels, 81 x 81 directions",
+                    value=round(budget.psnr_of(T, _shown_eigen(opened)), 2), unit="dB", better="higher",
+                    peer=f"{T.numel() / size:.0f}:1; {decoded:.2f} dB before it is opened; opens in {seconds:.1f} s to "
+                    f"{opened.rank} components, {opened.maps.nbytes / 1e6:.1f} MB; eigen BTF of {plain.rank}, "
+                    f"{T.numel() / plain.maps.numel():.0f}:1: {budget.psnr_of(T, _shown_eigen(plain)):.2f} dB",
+                )  # fmt: skip
 
 
 def _baked(name: str) -> tuple[Btf, Tensor]:

@@ -14,12 +14,27 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from torchmeso.compress import stream
+from torchmeso.compress import factored, stream
 from torchmeso.compress.double_sh import DoubleShOptions
 from torchmeso.compress.eigen import EigenOptions
 from torchmeso.compress.sh_pca import ShPcaOptions
 from torchmeso.config import Config, MaterialConfig, MesoConfig
+<<<<<<< HEAD
 from torchmeso.data import btf, eigen_btf, gdm, journal, mdf, sh_btf, sh_pca_btf, store, textured, transform_btf
+=======
+from torchmeso.data import (
+    btf,
+    eigen_btf,
+    factored_btf,
+    journal,
+    mdf,
+    sh_btf,
+    sh_pca_btf,
+    store,
+    textured,
+    transform_btf,
+)
+>>>>>>> quant
 from torchmeso.errors import ConfigError, FormatError
 from torchmeso.geometry.mesh_file import Finish
 from torchmeso.meso import bake_btf, bake_gdm, bake_mdf
@@ -188,6 +203,8 @@ def open_model(path: str | Path, *, depth: bool = True, rank: int | None = None)
         reflectance = sh_pca_btf.load(path, rank=rank)
     elif "transform" in model.meta:
         reflectance = transform_btf.load(path, rank=rank).expanded()
+    elif "factored" in model.meta:
+        reflectance = factored.opened(factored_btf.load(path), rank)
     else:
         reflectance = eigen_btf.load(path, rank=rank)
     return Material(btf=reflectance, mdf=mdf.from_model(model) if depth else None)

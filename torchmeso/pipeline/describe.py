@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from torchmeso import config
-from torchmeso.data import btf, btfdbb, gdm, hsh, image, mdf, picture_set, ptm, rti, store
+from torchmeso.data import btf, btfdbb, btfdbb_colour, gdm, hsh, image, mdf, picture_set, ptm, rti, store
 from torchmeso.errors import FormatError, human_size
 from torchmeso.geometry import mesh, mesh_file, unwrap
 from torchmeso.geometry.mesh_file import Group
@@ -157,7 +157,7 @@ def _gdm(path: Path) -> dict[str, Any]:
 def _model(path: Path) -> dict[str, Any]:
     model = store.Model(path)
     about: dict[str, Any] = {"kind": f"run-time model ({model.meta.get('kind', 'unknown')})"}
-    kinds = {"eigen": _eigen, "sh": _double_sh, "sh_pca": _sh_pca, "transform": _transform}
+    kinds = {"eigen": _eigen, "sh": _double_sh, "sh_pca": _sh_pca, "transform": _transform, "factored": _factored}
     with store.reading(path):
         for kind, told in kinds.items():
             if kind in model.meta:
@@ -193,6 +193,18 @@ def _transform(model: store.Model) -> dict[str, Any]:
     transform = model.meta["transform"]
     about = {name: transform[name] for name in ("rank", "lights", "views")}
     return {**about, "texels": "{1} x {0}".format(*transform["texels"])}
+
+
+def _factored(model: store.Model) -> dict[str, Any]:
+    factored, texels = model.meta["factored"], model.read("factored.by_texel").shape[1:3]
+    return {
+        "rank": f"{factored['rank']} of each channel",
+        "colour model": f"{factored['colour']} ({btfdbb_colour.NAMES[factored['colour']]})",
+        "opens as": f"eigen BTF of rank {factored['opened_rank']}",
+        "lights": factored["lights"],
+        "views": factored["views"],
+        "texels": f"{texels[1]} x {texels[0]}",
+    }
 
 
 def _psnr(model: store.Model) -> dict[str, Any]:
