@@ -19,13 +19,11 @@ from torchmeso.compress.double_sh import DoubleShOptions
 from torchmeso.compress.eigen import EigenOptions
 from torchmeso.compress.sh_pca import ShPcaOptions
 from torchmeso.config import Config, MaterialConfig, MesoConfig
-<<<<<<< HEAD
-from torchmeso.data import btf, eigen_btf, gdm, journal, mdf, sh_btf, sh_pca_btf, store, textured, transform_btf
-=======
 from torchmeso.data import (
     btf,
     eigen_btf,
     factored_btf,
+    gdm,
     journal,
     mdf,
     sh_btf,
@@ -34,7 +32,6 @@ from torchmeso.data import (
     textured,
     transform_btf,
 )
->>>>>>> quant
 from torchmeso.errors import ConfigError, FormatError
 from torchmeso.geometry.mesh_file import Finish
 from torchmeso.meso import bake_btf, bake_gdm, bake_mdf
