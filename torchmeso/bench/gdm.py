@@ -3,7 +3,7 @@
 Test: tests/bench/test_gdm.py
 """
 
-from torchmeso.bench import gdm_speed
+from torchmeso.bench import gdm_error, gdm_speed
 from torchmeso.bench.suite import Measurement
 
 MEASUREMENTS = [
@@ -13,4 +13,7 @@ MEASUREMENTS = [
     Measurement("walk", gdm_speed.walk),
     Measurement("leaks", gdm_speed.leaks),
     Measurement("slices", gdm_speed.slices),
+    Measurement("distance", gdm_error.distance),
+    Measurement("silhouette", gdm_error.silhouette),
+    Measurement("distortion", gdm_error.distortion),
 ]

@@ -13,6 +13,7 @@ from functools import partial
 from typing import Literal, NamedTuple
 
 import torch
+from jaxtyping import Int
 from torch import Tensor
 
 from torchmeso.bench import peers
@@ -185,7 +186,7 @@ def backends(context: Context) -> Iterator[Row]:
         "backends.opencl_vs_torch", "a frame with shadows, 512 x 512, 4,880 prisms: times as fast as torch", timing,
         "ours", "torch", 10, None,
     )  # fmt: skip
-    built, entries = _camera_entries(mesh, gdm.h, camera)
+    built, entries, _ = camera_entries(mesh, gdm.h, camera)
     passed = int(gdm_trace.trace(built, gdm, entries).prisms.sum())
     t = time_together({"trace": lambda: gdm_trace.trace(built, gdm, entries)}, n=3, warm=0)["trace"]
     yield Row(
@@ -199,7 +200,7 @@ def walk(context: Context) -> Iterator[Row]:
     """All pixels of the test scenes: the same prisms as in float64 from entry to exit, and the same material met."""
     for name, row in rows_7().items():
         gdm = table(row.meso, GdmOptions(texels=row.texels, layers=row.layers), context, **row.arguments)
-        built, entries = _camera_entries(row.mesh, gdm.h, view())
+        built, entries, _ = camera_entries(row.mesh, gdm.h, view())
         truth = gdm_trace.trace(built, None, entries, floor=False)
         found = DeviceTrace(built, row.mesh, None, floor=False).trace(entries)
         same = (found.prism == truth.prism) & (found.through == truth.through) & (found.prisms == truth.prisms)
@@ -298,8 +299,8 @@ def slices(context: Context) -> Iterator[Row]:
     )  # fmt: skip
 
 
-def _camera_entries(mesh: Mesh, h: float, camera: Camera) -> tuple[shell.Shell, Entries]:
-    """Return a shell and the rays of a picture, each where it first comes in."""
+def camera_entries(mesh: Mesh, h: float, camera: Camera) -> tuple[shell.Shell, Entries, Int[Tensor, "n"]]:
+    """Return a shell and the rays of a picture, each where it first comes in, and their pixels."""
     built = shell.build(mesh, h)
     bound = shell.boundary(built)
     layers = rasterize(camera, built.vertices, bound.faces)
@@ -313,7 +314,8 @@ def _camera_entries(mesh: Mesh, h: float, camera: Camera) -> tuple[shell.Shell, 
     origin, direction, _ = camera.rays(xy)
     # From where the face is, so that float32 is enough on both sides.
     start = origin + layers.t[entering, None] * direction
-    return built, Entries(start.float().double(), direction.float().double(), bound.tet[face], bound.corner[face])
+    entries = Entries(start.float().double(), direction.float().double(), bound.tet[face], bound.corner[face])
+    return built, entries, layers.pixel[entering]
 
 
 def _squeezed(mesh: Mesh) -> Mesh:
