@@ -53,7 +53,7 @@ def start(place, *arguments, limit=None, after="pass") -> subprocess.Popen:
 
 def finish(place, *arguments, **options) -> tuple[int, str]:
     process = start(place, *arguments, **options)
-    _, said = process.communicate(timeout=300)
+    _, said = process.communicate(timeout=900)
     return process.returncode, said
 
 
@@ -142,7 +142,8 @@ def test_every_long_command_leaves_nothing_half_written(command, signal, place):
         _, said = process.communicate(timeout=120)
         if process.returncode == 0:
             break
-        assert process.returncode == (130 if signal == 2 else -9), said
+        unheard = signal == 2 and process.returncode == -2 and not said  # on a busy machine Python had not begun yet
+        assert unheard or process.returncode == (130 if signal == 2 else -9), said
         assert "Traceback" not in said
         assert half_written(place) == []
     whole = ("render", "slow.yaml", "--out", "b.png")
