@@ -8,7 +8,7 @@ from torchmeso.compress import double_sh, eigen
 from torchmeso.compress.budget import psnr_of
 from torchmeso.compress.double_sh import DoubleShOptions
 from torchmeso.compress.eigen import EigenOptions
-from torchmeso.compress.quantize import quantize, spread, steps
+from torchmeso.compress.quantize import one_by_one, quantize, spread, steps
 from torchmeso.data import eigen_btf, sh_btf
 from torchmeso.meso import bake_btf, generators
 from torchmeso.meso.bake_btf import BtfOptions
@@ -69,6 +69,14 @@ def test_adaptive_codes_are_few_and_spread_over_the_byte(rng):
     codes = quantize(x, "adaptive", torch.tensor([[1.0], [20.0]]).expand(2, 3)).codes
     assert 5 <= len(codes[:, 0].unique()) <= 9 and codes[:, 0].max() > 127
     assert not codes[:, 1].any()  # all within a step
+
+
+def test_one_by_one_is_as_all_at_once(rng):
+    x = torch.randn(300, 4, 3, generator=rng)
+    step = steps([spread(x[:, k]) for k in range(4)], torch.ones(4), 0.1)
+    for storage in ("uint8", "float16", "float32", "adaptive"):
+        alone, together = one_by_one(x, storage, step), quantize(x, storage, step)
+        torch.testing.assert_close(decode(alone), decode(together))
 
 
 def test_adaptive_steps_of_constant_maps():

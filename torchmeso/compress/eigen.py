@@ -59,7 +59,7 @@ def fit(btf: Bands, options: EigenOptions | None = None, *, progress: Progress =
     if options.storage == "adaptive":
         spreads = (quantize.spread(maps[..., k, :]) for k in range(options.rank))
         step = adaptive_steps(btf, options.rank, total, spreads)
-    codes = quantize.quantize(maps, options.storage, step)
+    codes = quantize.one_by_one(maps, options.storage, step)
     return EigenBtf(
         maps=codes.codes, weights=W, scale=codes.scale, offset=codes.offset, lights=btf.lights, views=btf.views
     )

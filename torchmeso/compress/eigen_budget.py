@@ -126,7 +126,7 @@ def _adaptive(
         step = quantize.equal_steps(spreads, gain, d)
         # Of a component below its step next to all codes are 0: it would cost a picture more than it adds to it.
         rank = max(1, int((power[:most] > WORTH * step.amin(1).double().square()).sum()))
-        found = quantize.quantize(maps[..., :rank, :], storage, step[:rank])
+        found = quantize.one_by_one(maps[..., :rank, :], storage, step[:rank])
         return EigenBtf(
             maps=found.codes, weights=W[:, :rank], scale=found.scale, offset=found.offset,
             lights=table.lights, views=table.views,
@@ -134,8 +134,11 @@ def _adaptive(
 
     def estimate(d: float) -> float:
         found = model(d)
-        lost = (found.decoded() - maps[..., : found.rank, :]).square_().sum(dtype=torch.float64)
-        return budget.decibels((float(left_out[found.rank]) + float(lost)) / T.numel(), peak)
+        lost = float(left_out[found.rank])
+        for k in range(found.rank):
+            shown = found.offset[k] + found.scale[k] * found.maps[..., k, :].float()
+            lost += float((shown - maps[..., k, :]).square_().sum(dtype=torch.float64))
+        return budget.decibels(lost / T.numel(), peak)
 
     return budget.by_step(
         wanted,

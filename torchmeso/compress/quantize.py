@@ -139,6 +139,18 @@ def quantize(
     return Codes(values.float(), torch.ones_like(low), zero)
 
 
+def one_by_one(
+    values: Float[Tensor, "*batch rank channel"], storage: Storage, step: Float[Tensor, "rank channel"] | None = None
+) -> Codes:
+    """Return `quantize` of each component alone: the same bits as of one that is all there is, and no large copies."""
+    parts = [
+        quantize(values[..., k : k + 1, :], storage, None if step is None else step[k : k + 1])
+        for k in range(values.shape[-2])
+    ]
+    codes, scale, offset = zip(*parts, strict=True)
+    return Codes(torch.cat(codes, -2), torch.cat(scale), torch.cat(offset))
+
+
 def _stepped(values: Tensor, low: Tensor, high: Tensor, step: Tensor) -> Codes:
     flat = values.reshape(-1, *values.shape[-2:])
     # The mean lies on a code, so that a component without bits is its mean.
