@@ -152,6 +152,6 @@ def distortion(context: Context) -> Iterator[Row]:
             off = (found.t - hits.t.double()).abs()[both] / float(mesh.scale.mean())
             yield Row(
                 id=f"distortion.{name}.{factor}", unit="tile units", better="lower", n=len(off),
-                what=f"{name} of {len(mesh.faces)} triangles: median error of where rays end, by a base 16 times as fine",
+                what=f"{name} of {len(mesh.faces)} triangles: median error of where rays end, beside the finest",
                 value=round(float(off.median()), 5), curve={"series": name, "x": factor, "y": "median"},
             )  # fmt: skip
