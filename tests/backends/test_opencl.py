@@ -54,6 +54,24 @@ def test_environment_chooses_by_name(monkeypatch):
         opencl._choose([Platform])
 
 
+def test_a_processor_without_a_name_is_refused_at_once(device, monkeypatch):
+    class Device:
+        version, name = "OpenCL 3.0 PoCL HSTR: pthread-x86_64-unknown-linux-gnu-generic", "some"
+        int_ptr = 0
+
+    class Platform:
+        name, version = "Portable Computing Language", "OpenCL 3.0 PoCL 3.0"
+
+        def get_devices(self):
+            Device.platform = self
+            return [Device]
+
+    monkeypatch.setattr(opencl, "_choose", lambda platforms: Platform())
+    monkeypatch.setattr(opencl, "_rename", lambda record: False)
+    with pytest.raises(BackendError, match=r"PoCL 3\.0 knows, got 'some'; install a younger PoCL, or use the torch"):
+        opencl.queue.__wrapped__()
+
+
 def test_auto_falls_back_to_torch_with_one_warning(no_platform):
     with pytest.warns(UserWarning, match="got none; running on the torch backend"):
         assert opencl.resolve("auto") == "torch"

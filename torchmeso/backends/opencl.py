@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from importlib.resources import files
-from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Literal
 
@@ -22,7 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchmeso.backends import BackendChoice
+from torchmeso.backends import BackendChoice, processor
 from torchmeso.errors import BackendError, human_size
 
 if TYPE_CHECKING:
@@ -97,11 +96,24 @@ def queue() -> "cl.CommandQueue":
     """Return the queue on the chosen device.
 
     Raises:
-        BackendError: no platform is installed, or none matches TORCHMESO_OPENCL.
+        BackendError: no platform is installed, none matches TORCHMESO_OPENCL, or PoCL's compiler does not know this
+            processor and cannot be told.
     """
     cl = _pyopencl()
     device = _choose(cl.get_platforms()).get_devices()[0]
+    if device.version.endswith("-generic") and not _rename(device.int_ptr):
+        raise BackendError(
+            f"opencl: expected a processor that the compiler of {device.platform.version} knows, got "
+            f"'{device.name}'; install a younger PoCL, or use the torch backend"
+        )
     return cl.CommandQueue(cl.Context([device]), properties=cl.command_queue_properties.PROFILING_ENABLE)
+
+
+@cache  # the device keeps its new name, and says the old one
+def _rename(record: int) -> bool:
+    """Give a processor younger than PoCL's compiler a name that it knows; return whether that could be done."""
+    name = processor.name_known(processor.flags())
+    return name is not None and processor.rename(record, name)
 
 
 @cache
@@ -198,11 +210,7 @@ def _widened(source: str) -> str:
 @cache
 def _instructions() -> tuple[str, ...]:
     """Return `AVX512`, and `DOT_PRODUCTS`, where the chosen device is this processor and it has them."""
-    try:
-        found = re.search(r"^flags\s*:(.*)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
-    except OSError:
-        return ()
-    flags = {flag.replace("_", "") for flag in found[1].split()} if found else set()  # avx512_vnni
+    flags = {flag.replace("_", "") for flag in processor.flags()}  # avx512_vnni
     if not _shares_memory() or not flags.issuperset(AVX512):
         return ()
     return AVX512 + DOT_PRODUCTS * flags.issuperset(DOT_PRODUCTS)
