@@ -47,6 +47,7 @@ static INNER void trace_sixteen(__global const Ray *rays, const Shells *shells, 
     }
     atomic_add(counted, met.prisms);
     atomic_add(counted + 1, met.steps);
+    atomic_add(counted + 2, met.carried);
 }
 
 __kernel __attribute__((reqd_work_group_size(1, 1, 1)))

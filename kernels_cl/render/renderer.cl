@@ -278,6 +278,7 @@ static int look_from_within(const Place *place, const Rays *rays, __global const
         tally->prisms += met.prisms;
         tally->tets += met.steps;
         tally->endless += __builtin_popcount(met.endless);
+        tally->carried += met.carried;
         if (i == 0) {
             const Vector3 up = {0.0f, 0.0f, 1.0f}, along = {1.0f, 0.0f, 0.0f};
             seen->at = framed(up, along, (float16)1.0f);

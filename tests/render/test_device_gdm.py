@@ -15,13 +15,12 @@ def weave():
 
 
 def at(gdm, codes, phi, row, z, y, x):
-    """The pair of codes at a place, as kernels find it."""
+    """The four codes at a place, as kernels find them."""
     layers, height, width = (-(-n // side) for n, side in zip(gdm.voxels, BRICK, strict=True))
     brick = ((z // 2) * height + y // 4) * width + x // 4
     voxel = ((z % 2) * 4 + y % 4) * 4 + x % 4
-    return codes[2 * (((phi * (gdm.directions.n_theta + 1) + row) * layers * height * width + brick) * 32 + voxel) :][
-        :2
-    ]
+    word = ((phi * (gdm.directions.n_theta + 1) + row) * layers * height * width + brick) * 32 + voxel
+    return codes[4 * word :][:4]
 
 
 def test_codes_are_those_of_the_table(weave):
@@ -31,14 +30,14 @@ def test_codes_are_those_of_the_table(weave):
     kinds = set()
     for _ in range(400):
         z, y, x = (int(rng.integers(n)) for n in weave.voxels)
-        row, phi = int(rng.integers(1, 4)), int(rng.integers(7))
+        row, phi = int(rng.integers(1, 4)), int(rng.integers(6))
         got = at(weave, codes, phi, row, z, y, x)
-        for k in (0, 1):
-            ring = row + k - 1
-            expected = int(weave.distance[z, y, x, ring, phi % 6])
+        for k in range(4):
+            ring, azimuth = row + k % 2 - 1, (phi + k // 2) % 6
+            expected = int(weave.distance[z, y, x, ring, azimuth])
             if weave.occupancy[z, y, x] > 0.5:
                 expected = SOLID
-            elif weave.left[z, y, x, ring, phi % 6]:
+            elif weave.left[z, y, x, ring, azimuth]:
                 expected = LEFT
             assert got[k] == min(expected, LEFT if expected >= SOLID else SOLID - 1)
             kinds.add(min(expected, SOLID - 1) if expected < SOLID else expected)

@@ -12,7 +12,7 @@ from torchmeso.geometry.light import PointLight
 from torchmeso.meso import bake_gdm, generators
 from torchmeso.meso.bake_gdm import GdmOptions
 from torchmeso.render import frame
-from torchmeso.render.frame import FrameOptions
+from torchmeso.render.frame import FrameOptions, Skips
 from torchmeso.render.renderer import Renderer
 from torchmeso.render.scene import Material, Object, Scene, ShellOptions
 
@@ -167,3 +167,19 @@ def test_a_new_material_alone_keeps_the_tables(weave):
     renderer.update(other)
     shown = renderer.render(eye).rgb.clone()
     torch.testing.assert_close(shown, Renderer(other, OPTIONS).render(eye).rgb, rtol=0, atol=0)
+
+
+def test_what_a_look_up_found_empty_is_not_asked_again(device):
+    """Prisms are small beside the ways through the table; nearly every pixel is the same."""
+    gdm = bake_gdm.in_memory(generators.weave(), GdmOptions(texels=24, layers=9, n_theta=8, n_phi=16))
+    body = shapes.torus(triangles=4000, tiles=(4, 1))
+    scene = Scene(objects=(Object(mesh=body, material=Material(gdm=gdm)),), lights=(sun(0.4, 1.0, 0.3),))
+    eye = camera((0.5, 2.2, 2.4), size=160)
+    on, off = (Renderer(scene, replace(OPTIONS, skips=Skips(carried=x))).render(eye) for x in (True, False))
+    counter = "prisms passed without a look-up"
+    assert on.counts[counter] > 0.1 * on.counts["prisms passed"]
+    assert off.counts[counter] == 0
+    seen = torch.isfinite(off.depth)
+    assert (torch.isfinite(on.depth) != seen).double().mean() < 2e-3
+    moved = (on.depth - off.depth)[seen & torch.isfinite(on.depth)].abs()
+    assert (moved > 2 * gdm.voxel).double().mean() < 1e-2

@@ -39,8 +39,8 @@ class Query(NamedTuple):
     Attributes:
         distance: (...) way to the material, or to where the table ends for a ray that meets none.
         left: (...) whether it meets none until there.
-        near: (...) way to the material that the samples which meet some tell of, fewer than half of them where `left`;
-            inf where none does.
+        near: (...) way to the nearest surface that samples tell of, fewer than half of them where `left`; inf where
+            there is none.
     """
 
     distance: Float[Tensor, "*batch"]
@@ -141,21 +141,21 @@ class Gdm:
         found = tables.distance.flatten()[index].to(share.dtype)
         if self.distance.dtype == torch.uint8:
             found = found * (self.cap / 255)
-        carried = self._of_one_surface((found + ahead.unsqueeze(-1)).flatten(-2), share * met, hits)
+        carried, first = self._of_one_surface((found + ahead.unsqueeze(-1)).flatten(-2), share * met, hits)
         # A ray towards corners inside solid meets something, though its neighbours that start outside may pass.
         before = weight * solid * (ahead > 0)
         blocks = before.sum(-1)
         at_corner = (before * ahead).sum(-1) / blocks.clamp(min=1e-12)
-        distance = torch.where(hits > 1e-6, carried, at_corner)
+        distance, first = (torch.where(hits > 1e-6, x, at_corner) for x in (carried, first))
         hits = hits + blocks
         end = self.boundary(place, w)
         left = ~inside & (misses >= hits)
-        near = torch.minimum(distance.clamp(min=0), end)
-        distance = torch.where(inside, 0, torch.where(left, end, near))
-        return Query(distance, left, torch.where(hits > 1e-6, near, torch.inf))
+        distance = torch.minimum(distance.clamp(min=0), end)
+        near = torch.where(hits > 1e-6, torch.minimum(first.clamp(min=0), distance), torch.inf)
+        return Query(torch.where(inside, 0, torch.where(left, end, distance)), left, near)
 
-    def _of_one_surface(self, carried: Tensor, share: Tensor, hits: Tensor) -> Tensor:
-        """Return the mean of distances; where they are of two surfaces, far apart, that of the larger share."""
+    def _of_one_surface(self, carried: Tensor, share: Tensor, hits: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the mean of distances, twice; of two surfaces that of the larger share, and the first one's."""
         total = (share * carried).sum(-1)
         mean = total / hits.clamp(min=1e-12)
         near = share * (carried <= mean.unsqueeze(-1))
@@ -163,7 +163,7 @@ class Gdm:
         farther = hits - nearer
         first, second = before / nearer.clamp(min=1e-12), (total - before) / farther.clamp(min=1e-12)
         two = (second - first > APART * self.voxel) & (nearer > 1e-6) & (farther > 1e-6)
-        return torch.where(two, torch.where(nearer >= farther, first, second), mean)
+        return torch.where(two, torch.where(nearer >= farther, first, second), mean), torch.where(two, first, mean)
 
     def boundary(self, place: Float[Tensor, "*batch 3"], w: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         """Return the way along `w` to the top or bottom of the slab, at most `cap`."""

@@ -17,8 +17,8 @@ from torchmeso.geometry import sphere
 
 GDM = np.dtype(
     [(name, "i4") for name in ("there", "layers", "height", "width", "n_theta", "n_phi", "table")]
-    + [(name, "i4") for name in ("per_phi", "per_ring", "matter", "queries", "floor")]
-    + [("h", "f4"), ("cap", "f4"), ("unit", "f4"), ("albedo", "f4", 3), ("pad", "i4", 2)]
+    + [(name, "i4") for name in ("per_phi", "per_row", "matter", "queries", "floor")]
+    + [("h", "f4"), ("cap", "f4"), ("unit", "f4"), ("albedo", "f4", 3), ("bend", "f4"), ("pad", "i4")]
 )
 """See `Gdm` in kernels_cl/data/gdm.clh."""
 
@@ -38,6 +38,7 @@ class Dressing(NamedTuple):
         queries: look-ups per prism.
         floor: whether the bottom is solid.
         albedo: of the bottom.
+        bend: how far, tile units, a way may turn from a straight one before a table is asked again; 0: in every prism.
     """
 
     gdm: Gdm | None
@@ -45,6 +46,7 @@ class Dressing(NamedTuple):
     queries: int = 1
     floor: bool = True
     albedo: tuple[float, float, float] = (0.6, 0.6, 0.6)
+    bend: float = 0.0
 
 
 class DeviceGdms(NamedTuple):
@@ -95,6 +97,7 @@ def upload_gdms(dressings: Sequence[Dressing | None], before: DeviceGdms | None 
         if d is None:
             continue
         record["h"], record["queries"], record["floor"], record["albedo"] = d.h, d.queries, d.floor, d.albedo
+        record["bend"] = d.bend
         record["layers"], record["height"], record["width"] = 2, 1, 1
         if d.gdm is None:
             continue
@@ -102,27 +105,27 @@ def upload_gdms(dressings: Sequence[Dressing | None], before: DeviceGdms | None 
         record["there"], record["layers"], record["height"], record["width"] = 1, layers, height, width
         record["n_theta"], record["n_phi"] = d.gdm.directions.n_theta, d.gdm.directions.n_phi
         record["table"], record["matter"] = places[id(d.gdm)]
-        record["per_ring"] = _ring_bytes(d.gdm)
-        record["per_phi"] = record["per_ring"] * (d.gdm.directions.n_theta + 1)
+        record["per_row"] = _voxels(d.gdm)
+        record["per_phi"] = record["per_row"] * (d.gdm.directions.n_theta + 1)
         record["cap"], record["unit"] = d.gdm.cap, d.gdm.cap / 255
     return DeviceGdms(tables, opencl.upload(records), sources)
 
 
 def table_bytes(gdm: Gdm) -> int:
     """Return how many bytes `table_codes` takes."""
-    return (gdm.directions.n_phi + 1) * (gdm.directions.n_theta + 1) * _ring_bytes(gdm) + 4
+    return 4 * gdm.directions.n_phi * (gdm.directions.n_theta + 1) * _voxels(gdm)
 
 
-def _ring_bytes(gdm: Gdm) -> int:
-    """Return bytes of all bricks in one direction, two per voxel."""
-    return 2 * math.prod(-(-n // side) * side for n, side in zip(gdm.voxels, BRICK, strict=True))
+def _voxels(gdm: Gdm) -> int:
+    """Return the voxels of all bricks."""
+    return math.prod(-(-n // side) * side for n, side in zip(gdm.voxels, BRICK, strict=True))
 
 
 def table_codes(gdm: Gdm) -> UInt8[np.ndarray, "byte"]:
-    """Return a table as kernels read it, (phi + 1, row, brick, voxel, 2): codes of distance, LEFT or SOLID.
+    """Return a table as kernels read it, (phi, row, brick, voxel, 4): codes of distance, LEFT or SOLID.
 
-    Rows are the rings and a pole before and behind them; each pair is of a row and the next. The first azimuth stands
-    once more behind the last.
+    Rows are the rings and a pole before and behind them; the four codes are of a row and the next, at an azimuth and
+    at the next one.
     """
     distance, left = gdm.distance, gdm.left
     if distance.dtype != torch.uint8:
@@ -140,9 +143,7 @@ def table_codes(gdm: Gdm) -> UInt8[np.ndarray, "byte"]:
     bricks = codes.reshape(layers // 2, 2, height // 4, 4, width // 4, 4, *codes.shape[3:])
     by_direction = bricks.permute(7, 6, 0, 2, 4, 1, 3, 5)
     pairs = torch.stack([by_direction[:, :-1], by_direction[:, 1:]], -1)
-    whole = np.zeros(table_bytes(gdm), np.uint8)  # four bytes are read at each place
-    whole[:-4] = torch.cat([pairs, pairs[:1]]).flatten().numpy()
-    return whole
+    return torch.cat([pairs, pairs.roll(-1, 0)], -1).flatten().numpy()
 
 
 def matter_codes(gdm: Gdm) -> UInt16[np.ndarray, "voxel 16"]:

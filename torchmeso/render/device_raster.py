@@ -38,9 +38,9 @@ COUNTERS = (
     "used", "vectors", "slots", "tile", "crossing", "behind", "degenerate", "drawn", "fragments",
     "deepest", "covered", "intervals", "deep", "carved", "inside", "hidden", "looked", "spared", "empty",
     "beside", "turned", "losers", "bounded", "near_bodies", "averted", "kept",
-    "stamps", "asked", "prisms", "tets", "endless",
+    "stamps", "asked", "prisms", "tets", "endless", "carried",
 )  # fmt: skip
-"""What the kernels count, in the order of `Counters` in kernels_cl/render/rasterize.clh; padded to 32."""
+"""What the kernels count, in the order of `Counters` in kernels_cl/render/rasterize.clh: 32."""
 
 OF_SET_UP = [
     COUNTERS.index(x)

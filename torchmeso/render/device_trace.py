@@ -29,10 +29,12 @@ class DeviceTrace:
 
     Attributes:
         milliseconds: that the kernel took for the last rays.
-        passed: prisms and tetrahedra that they passed.
+        passed: prisms and tetrahedra that they passed, and those prisms that took no look-up.
     """
 
-    def __init__(self, shell: Shell, mesh: Mesh, gdm: Gdm | None, *, queries: int = 1, floor: bool = True):
+    def __init__(
+        self, shell: Shell, mesh: Mesh, gdm: Gdm | None, *, queries: int = 1, floor: bool = True, bend: float = 0.0
+    ):
         """Upload them; `gdm` None: rays walk through to the end.
 
         Raises:
@@ -40,8 +42,8 @@ class DeviceTrace:
         """
         self._shells = upload_shells([(shell, mesh, 0)])
         h = float(-shell.uvz[..., 2].min())
-        self._gdms = upload_gdms([Dressing(gdm, h, queries, floor)])
-        self.milliseconds, self.passed = 0.0, (0, 0)
+        self._gdms = upload_gdms([Dressing(gdm, h, queries, floor, bend=bend)])
+        self.milliseconds, self.passed = 0.0, (0, 0, 0)
 
     def trace(self, entries: Entries) -> Traced:
         """Return what rays meet, as `gdm_trace.trace`; rays that do not end have `prisms` -1."""
@@ -57,7 +59,7 @@ class DeviceTrace:
         call()
         found = opencl.fetch(answers, np.zeros(n, ANSWER))
         self.milliseconds = call.milliseconds
-        self.passed = tuple(opencl.fetch(counted, np.zeros(16, np.int32))[:2].tolist())
+        self.passed = tuple(opencl.fetch(counted, np.zeros(16, np.int32))[:3].tolist())
         columns = {name: torch.from_numpy(np.ascontiguousarray(found[name])) for name in found.dtype.names or ()}
         return Traced(
             hit=columns["hit"] != 0,

@@ -40,6 +40,8 @@ class Skips:
         facing: points that lean away from all lights ask a screen for neither depth nor shadow.
         resting: shadow maps stay while light and objects do, and triangles on the screen while the camera does.
         unlit: lights that reach no object are left out.
+        carried: what a look-up in a shell found empty ahead is not asked again in the next prisms, while the way
+            through them turns little; a pixel in hundreds moves by less than a voxel, one in thousands by more.
         unseen: what stops the light is found out only in stamps of a shadow map where it could shadow what is seen.
     """
 
@@ -54,6 +56,7 @@ class Skips:
     resting: bool = True
     unlit: bool = True
     unseen: bool = True
+    carried: bool = True
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -31,7 +31,7 @@ from torchmeso.render import device, device_gdm, device_shell, device_tables, fi
 from torchmeso.render.casters import Corners, corners_of
 from torchmeso.render.device_raster import ROOM, STAMPS, DeviceViews
 from torchmeso.render.film import Picture
-from torchmeso.render.frame import MEMORY_LIMIT, FrameOptions
+from torchmeso.render.frame import MEMORY_LIMIT, FrameOptions, Skips
 from torchmeso.render.scene import Material, Scene, World, assemble
 
 MAX_LIGHTS = 64
@@ -39,6 +39,9 @@ MAX_LIGHTS = 64
 
 DETAILS, DISPLAY = 1, 2
 """What a frame writes: a `Picture`, or bytes for a screen."""
+
+BEND = 1.0
+"""Voxels that a way through a shell may turn from a straight one before its table is asked again."""
 
 MOST_STARTS = 4
 """Tetrahedra of shells that the eye is in; the others of a shell that overlaps itself more often are left out."""
@@ -416,7 +419,9 @@ def _upload(scene: Scene, options: FrameOptions, before: _OnDevice | None = None
         ambient=scene.ambient > 0,
         before=None if before is None else before.materials,
     )
-    gdms = device_gdm.upload_gdms([_dressing(m) for m in scene.surfaces], None if before is None else before.gdms)
+    gdms = device_gdm.upload_gdms(
+        [_dressing(m, options.skips) for m in scene.surfaces], None if before is None else before.gdms
+    )
     object_of = [i for i, o in enumerate(scene.objects) for _ in o.materials]
     same = before is not None and _are(_meshes(scene), _meshes(before.scene)) and object_of == before.object_of
     if before is not None and same:
@@ -431,12 +436,12 @@ def _upload(scene: Scene, options: FrameOptions, before: _OnDevice | None = None
     )
 
 
-def _dressing(material: Material) -> device_gdm.Dressing | None:
-    if material.gdm is None:
+def _dressing(material: Material, skips: Skips) -> device_gdm.Dressing | None:
+    gdm, form = material.gdm, material.shell
+    if gdm is None:
         return None
-    return device_gdm.Dressing(
-        material.gdm, material.gdm.h, material.shell.queries, material.shell.base == "solid", material.albedo
-    )
+    bend = BEND * gdm.voxel if skips.carried else 0.0
+    return device_gdm.Dressing(gdm, gdm.h, form.queries, form.base == "solid", material.albedo, bend)
 
 
 @dataclass(eq=False, kw_only=True)
@@ -535,4 +540,5 @@ def _named(counts: dict[str, int], camera: Camera) -> dict[str, int]:
         "prisms passed": counts["prisms"],
         "tetrahedra passed": counts["tets"],
         "rays lost in a shell": counts["endless"],
+        "prisms passed without a look-up": counts["carried"],
     }
