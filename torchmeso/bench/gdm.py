@@ -3,10 +3,11 @@
 Test: tests/bench/test_gdm.py
 """
 
-from torchmeso.bench import gdm_error, gdm_speed
+from torchmeso.bench import gdm_bake, gdm_error, gdm_speed
 from torchmeso.bench.suite import Measurement
 
 MEASUREMENTS = [
+    Measurement("bake", gdm_bake.bake),
     Measurement("embree", gdm_speed.against_embree),
     Measurement("fig7", gdm_speed.figure_7),
     Measurement("backends", gdm_speed.backends),
