@@ -60,7 +60,7 @@ def test_what_is_too_large_is_not_measured(monkeypatch, tmp_path):
 def test_the_rows_of_table_ii(tmp_path, rng, device, monkeypatch):
     """Of a table of four texels, so that only the figures' form is tested."""
     monkeypatch.setenv("TORCHMESO_CACHE", str(tmp_path))
-    monkeypatch.setattr(table2, "brick", lambda: base(rng))
+    monkeypatch.setattr(table2, "brick", lambda size: base(rng))
     write, run = table2.write_table, table2.Run(10.0, 12.0 * table2.CORES, int(1.5e9), int(3e8), int(2e8))
     monkeypatch.setattr(table2, "write_table", lambda b, size, path, context: write(b, 4, path, context))
 

@@ -1,8 +1,9 @@
 """Rows of the suite `compress` from disk to disk: Table II of leung2007tileable, each fit a process of its own.
 
-The BTF is a baked brick of 64 x 64 texels repeated, with a gain of its own and noise for every texel, as sRGB codes in
-a raw table (which is what pictures become), or as JPEG files. Before a fit the pages of its files are given back to
-the system (fsync and POSIX_FADV_DONTNEED), and the disk's own time to read them is measured in the same run.
+The BTF is a baked brick, 256 x 256 texels of it under 800 x 800, repeated with a gain of its own and noise for every
+texel, as sRGB codes in a raw table (which is what pictures become), or as JPEG files. Before a fit the pages of its
+files are given back to the system (fsync and POSIX_FADV_DONTNEED), and the disk's own time to read them is measured in
+the same run.
 "End to end" begins with the start of Python and ends with the model on disk.
 
 Test: tests/bench/test_table2.py
@@ -33,8 +34,8 @@ from torchmeso.meso.bake_btf import BtfOptions
 PAPER_SECONDS = {(128, 25): 613, (128, 36): 761, (256, 25): 1067, (256, 36): 1251, (800, 25): 10289}
 """leung2007tileable, Table II: side of the texture, view coefficients; 25 of the light; a Pentium IV of 3.2 GHz."""
 
-BASE = 64
-"""Texels of the baked brick."""
+MOST_BAKED = 256
+"""Texels of the baked brick that is repeated; half of those of the table where that is less."""
 
 ROOM = 1.7
 """Disk that a fit takes, over the raw bytes: the table, its journal, the model."""
@@ -71,7 +72,6 @@ class Run(NamedTuple):
 
 def streamed(context: Context) -> Iterator[Row]:
     """Yield the six rows of Table II from a raw table on disk to a model on disk."""
-    base = None
     for size in (128, 256, 800):
         raw = 81 * 81 * size * size * 3
         why = "full run only" if context.quick and size == 800 else _no_room(ROOM * raw)
@@ -80,7 +80,7 @@ def streamed(context: Context) -> Iterator[Row]:
                 yield _row(size, terms, None, why=why)
             continue
         with _scratch() as place:
-            base = brick() if base is None else base
+            base = brick(size)
             table = Path(place) / "raw.btf.zarr"
             write_table(base, size, table, context)
             for terms in (25, 36):
@@ -111,7 +111,7 @@ def pictures(context: Context) -> Iterator[Row]:
     size = 128 if context.quick else 256
     with _scratch() as place:
         folder = Path(place) / "set"
-        n_bytes = write_pictures(brick(), size, folder)
+        n_bytes = write_pictures(brick(size), size, folder)
         alone = drop_and_read(folder)
         drop(folder)
         run = compress(folder, Path(place) / "a.meso", cache=Path(place) / "cache")
@@ -140,9 +140,9 @@ def _row(
     )  # fmt: skip
 
 
-def brick() -> Float[Tensor, "light view H W 3"]:
-    """Return the baked brick that is repeated, in half precision."""
-    options = BtfOptions(texels=BASE, lights="ubo81", views="ubo81", samples=1, bounces=0)
+def brick(size: int) -> Float[Tensor, "light view H W 3"]:
+    """Return the baked brick that is repeated in a table of `size` texels, in half precision."""
+    options = BtfOptions(texels=min(size // 2, MOST_BAKED), lights="ubo81", views="ubo81", samples=1, bounces=0)
     return bake_btf.in_memory(generators.brick(), options).pictures().half()
 
 
