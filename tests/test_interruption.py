@@ -146,6 +146,8 @@ def test_every_long_command_leaves_nothing_half_written(command, signal, place):
         assert unheard or process.returncode == (130 if signal == 2 else -9), said
         assert "Traceback" not in said
         assert half_written(place) == []
+        if (place / command[-1]).is_file():  # stopped between the end of its work and its own
+            break
     whole = ("render", "slow.yaml", "--out", "b.png")
     assert finish(place, *whole)[0] == 0
 
