@@ -1,7 +1,7 @@
 """The command line: one thin function per job. Heavy imports stay inside the functions (torch costs 2 s).
 
 Results go to stdout, one line per product; progress and warnings to stderr. A MesoError becomes one sentence
-and exit status 2; a bug keeps its traceback. `compress`, which has the most options, has a file of its own.
+and exit status 2; a bug keeps its traceback. `compress` and `synthesize` have files of their own.
 
 Test: tests/test_cli.py
 """
@@ -16,6 +16,7 @@ import click
 
 from torchmeso.backends.allocator import keep_freed_memory
 from torchmeso.cli_compress import compress
+from torchmeso.cli_synthesize import synthesize
 from torchmeso.console import progress as _progress
 from torchmeso.console import refuse_to_replace as _refuse_to_replace
 from torchmeso.errors import ConfigError, MesoError, StorageError
@@ -156,6 +157,7 @@ def _bake_one(meso: str, out: Any, force: bool, options: dict[str, Any]) -> None
 
 
 main.add_command(compress)
+main.add_command(synthesize)
 
 
 @main.command()
