@@ -3,9 +3,11 @@ import torch
 from click.testing import CliRunner
 
 from tests.synthesize import looks
+from torchmeso import config
 from torchmeso.cli import main
 from torchmeso.data import eigen_btf, image, quilting_map, sh_pca_btf
-from torchmeso.pipeline import describe
+from torchmeso.errors import ConfigError
+from torchmeso.pipeline import bake, describe
 from torchmeso.synthesize import patch_error, quilting
 
 
@@ -80,3 +82,27 @@ def test_other_files_are_no_exemplars(tmp_path):
 def test_a_single_texel_and_tolerance_0(picture, tmp_path):
     assert run(picture, "--size", 1, "--out", tmp_path / "a.quilt").exit_code == 0
     assert run(picture, "--size", 30, "--tolerance", 0, "--out", tmp_path / "b.quilt").exit_code == 0
+
+
+def test_a_configuration_lays_pictures_out_by_a_map(picture, tmp_path):
+    assert run(picture, "--size", 60, "--tileable", "--out", tmp_path / "a.quilt").exit_code == 0
+    content = {
+        "materials": {"m": {"albedo_map": "p.png", "quilting": "a.quilt"}},
+        "objects": [{"shape": "plane", "material": "m", "tiles": 4}],
+        "camera": {"eye": [0, 2, 0.1], "width": 8, "height": 8},
+    }
+    settings = config.parse(content, folder=tmp_path)
+    material = bake.prepare(settings)["m"].material
+    assert material.btf.quilting.texels == (60, 60) and material.btf.quilting.source == (20, 24)
+
+
+@pytest.mark.errors
+@pytest.mark.parametrize("material", [{"albedo": [1, 1, 1]}, {"model": "a.gdm.zarr"}])
+def test_a_map_needs_something_to_lay_out(material, tmp_path):
+    content = {
+        "materials": {"m": {**material, "quilting": "a.quilt"}},
+        "objects": [{"shape": "plane", "material": "m"}],
+        "camera": {"eye": [0, 2, 0.1]},
+    }
+    with pytest.raises(ConfigError, match="'quilting' lays out a BTF, an MDF or pictures"):
+        config.parse(content, folder=tmp_path)

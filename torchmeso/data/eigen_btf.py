@@ -129,7 +129,7 @@ class EigenBtf:
 
         def look_up(which: Tensor, uv: Tensor, level: int) -> Tensor:
             E = self.ambient_maps[level]
-            taps = address.of_level(uv, *E.shape[:2], level, self.quilting)
+            taps = address.of_level(uv, E.shape[0], E.shape[1], level, self.quilting)
             return (E.flatten(0, 1)[taps.texel].to(uv.dtype) * taps.weight[..., None, None]).sum(-3)
 
         return self._weighted(pyramid.average(look_up, uv, seen, *self._size, most=1), wo)

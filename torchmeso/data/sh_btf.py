@@ -130,7 +130,8 @@ class ShBtf:
         scale, offset = (x.to(uv.dtype).flatten(0, 1) for x in (self.scale, self.offset))
 
         def look_up(which: Tensor, uv: Tensor, level: int) -> Tensor:
-            taps = address.of_level(uv, *self.levels[level].shape[2:4], level, self.quilting)
+            height, width = self.levels[level].shape[2:4]
+            taps = address.of_level(uv, height, width, level, self.quilting)
             found = [
                 torch.einsum("ptkc,pt,pk,kc->pc", self._texels[level][texel].to(uv.dtype), share, w, scale)
                 for texel, share, w in zip(

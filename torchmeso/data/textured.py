@@ -101,7 +101,7 @@ def from_finish(finish: Finish) -> Textured:
 def _look_up(levels: list[Tensor], uv: Tensor, seen: Footprint | None, quilting: QuiltingMap | None) -> Tensor:
     def at(_: Tensor, uv: Tensor, level: int) -> Tensor:
         picture = levels[level]
-        taps = address.of_level(uv, *picture.shape[:2], level, quilting)
+        taps = address.of_level(uv, picture.shape[0], picture.shape[1], level, quilting)
         return (picture.reshape(-1, 3).to(uv.dtype)[taps.texel] * taps.weight.unsqueeze(-1)).sum(-2)
 
     return pyramid.average(at, uv, seen, max(levels[0].shape[:2]), len(levels))
