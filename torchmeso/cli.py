@@ -328,7 +328,7 @@ def _compare_btf(a: str, b: str, out: str | None, as_json: bool) -> None:
 
 
 @main.command()
-@click.argument("suite", type=click.Choice(["compress", "gdm", "render", "skip", "stability", "tables"]))
+@click.argument("suite", type=click.Choice(["compress", "gdm", "render", "skip", "stability", "synthesize", "tables"]))
 @click.option("--quick", is_flag=True, help="Fewer repetitions and sweep points; never smaller sizes.")
 @click.option("--prepare", is_flag=True, help="Only bake what the suite needs into the cache.")
 @click.option("--only", multiple=True, help="Rows whose id begins with this; may be repeated.")
@@ -338,6 +338,7 @@ def bench(suite: str, quick: bool, prepare: bool, only: tuple[str, ...], json_pa
     """Measure SUITE: accuracy against truth, time against peers in the same run."""
     from torchmeso.bench import colour, compress, frames, gdm, plot, render, skips, stability, tables
     from torchmeso.bench import suite as suites
+    from torchmeso.bench import synthesize as synthesis
 
     measurements = {
         "compress": compress.MEASUREMENTS,
@@ -345,6 +346,7 @@ def bench(suite: str, quick: bool, prepare: bool, only: tuple[str, ...], json_pa
         "render": render.MEASUREMENTS,
         "skip": skips.MEASUREMENTS,
         "stability": stability.MEASUREMENTS,
+        "synthesize": synthesis.MEASUREMENTS,
         "tables": tables.MEASUREMENTS,
     }
 
