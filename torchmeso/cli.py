@@ -1,7 +1,7 @@
 """The command line: one thin function per job. Heavy imports stay inside the functions (torch costs 2 s).
 
 Results go to stdout, one line per product; progress and warnings to stderr. A MesoError becomes one sentence
-and exit status 2; a bug keeps its traceback. `compress`, which has the most options, has a file of its own.
+and exit status 2; a bug keeps its traceback. `compress` and `synthesize` have files of their own.
 
 Test: tests/test_cli.py
 """
@@ -16,6 +16,7 @@ import click
 
 from torchmeso.backends.allocator import keep_freed_memory
 from torchmeso.cli_compress import compress
+from torchmeso.cli_synthesize import synthesize
 from torchmeso.console import progress as _progress
 from torchmeso.console import refuse_to_replace as _refuse_to_replace
 from torchmeso.errors import ConfigError, MesoError, StorageError
@@ -156,6 +157,7 @@ def _bake_one(meso: str, out: Any, force: bool, options: dict[str, Any]) -> None
 
 
 main.add_command(compress)
+main.add_command(synthesize)
 
 
 @main.command()
@@ -326,7 +328,7 @@ def _compare_btf(a: str, b: str, out: str | None, as_json: bool) -> None:
 
 
 @main.command()
-@click.argument("suite", type=click.Choice(["compress", "gdm", "render", "skip", "stability", "tables"]))
+@click.argument("suite", type=click.Choice(["compress", "gdm", "render", "skip", "stability", "synthesize", "tables"]))
 @click.option("--quick", is_flag=True, help="Fewer repetitions and sweep points; never smaller sizes.")
 @click.option("--prepare", is_flag=True, help="Only bake what the suite needs into the cache.")
 @click.option("--only", multiple=True, help="Rows whose id begins with this; may be repeated.")
@@ -336,6 +338,7 @@ def bench(suite: str, quick: bool, prepare: bool, only: tuple[str, ...], json_pa
     """Measure SUITE: accuracy against truth, time against peers in the same run."""
     from torchmeso.bench import colour, compress, frames, gdm, plot, render, skips, stability, tables
     from torchmeso.bench import suite as suites
+    from torchmeso.bench import synthesize as synthesis
 
     measurements = {
         "compress": compress.MEASUREMENTS,
@@ -343,6 +346,7 @@ def bench(suite: str, quick: bool, prepare: bool, only: tuple[str, ...], json_pa
         "render": render.MEASUREMENTS,
         "skip": skips.MEASUREMENTS,
         "stability": stability.MEASUREMENTS,
+        "synthesize": synthesis.MEASUREMENTS,
         "tables": tables.MEASUREMENTS,
     }
 

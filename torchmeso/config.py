@@ -92,7 +92,8 @@ class MaterialConfig(_Strict):
     A BTF becomes an eigen BTF, or a double-SH BTF where `double_sh` is given, or an SH + PCA BTF where `sh_pca` is.
     `rank` reads only that many components of a model; the others stay on disk. `albedo` multiplies `albedo_map`.
     With `gdm` the mesostructure stands as material of any form in a `shell` instead, above a `floor` of that colour; a
-    `model` may be a baked GDM (.gdm.zarr) too.
+    `model` may be a baked GDM (.gdm.zarr) too. `quilting` is a map (.quilt) that lays out BTF, MDF and pictures;
+    texture coordinates stay those of the exemplar.
     """
 
     meso: MesoConfig | None = None
@@ -110,6 +111,7 @@ class MaterialConfig(_Strict):
     gdm: GdmOptions | None = None
     shell: ShellOptions = Field(default_factory=ShellOptions)
     floor: Rgb = (0.6, 0.6, 0.6)
+    quilting: str | None = None
 
     @model_validator(mode="after")
     def _check(self) -> "MaterialConfig":
@@ -126,6 +128,8 @@ class MaterialConfig(_Strict):
             raise ValueError("'gdm' says how to bake a 'meso'; it has none")
         if self.model_fields_set & {"shell", "floor"} and not self.in_shell:
             raise ValueError("'shell' and 'floor' belong to a 'gdm' or to a 'model' that is one (.gdm.zarr)")
+        if self.quilting is not None and (self.in_shell or (plain and not (self.albedo_map or self.normal_map))):
+            raise ValueError("'quilting' lays out a BTF, an MDF or pictures; a GDM and a plain colour have none")
         if self.rank is not None and self.model is None:
             raise ValueError("'rank' belongs to a 'model'; a 'meso' has 'eigen: {rank: ...}'")
         return self
@@ -419,7 +423,7 @@ def data_dir() -> Path:
     return Path(os.environ.get("TORCHMESO_DATA", beside))
 
 
-PATH_KEYS = ("mesh", "model", "displacement", "albedo", "albedo_map", "normal_map", "path")
+PATH_KEYS = ("mesh", "model", "displacement", "albedo", "albedo_map", "normal_map", "path", "quilting")
 
 
 def _call(place: str, function: Callable[..., Any], arguments: dict[str, Any]) -> Any:

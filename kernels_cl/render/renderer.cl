@@ -2,7 +2,8 @@
 // Host: torchmeso/render/renderer.py
 //
 // Compiled with SILHOUETTE and MIXED (see silhouette.clh), ONE_LAYER, SHADOWS where lights have maps, FILTERED where
-// pixels average what they cover, HARMONICS where there are double-SH or SH + PCA BTFs, and GDM where there are shells.
+// pixels average what they cover, HARMONICS where there are double-SH or SH + PCA BTFs, QUILTED where there
+// are quilting maps, and GDM where there are shells.
 
 #include "data/sh_pca_btf.clh"
 #include "data/textured.clh"
@@ -81,15 +82,15 @@ static void shade_object(const Place *place, __global const Reflectance *reflect
         normal = diffuse_at(tables, reflectance, seen->at.u, seen->at.v, wo, pixel, bits, albedo);
 #ifdef HARMONICS
     } else if (harmonic) {
-        look_around(TABLE(Level, tables, reflectance->levels), reflectance->level_count, seen->at.u, seen->at.v, wo,
-                    pixel, MOST_PROBES, bits, &area);
+        look_around(tables, reflectance->quilt, TABLE(Level, tables, reflectance->levels), reflectance->level_count,
+                    seen->at.u, seen->at.v, wo, pixel, MOST_PROBES, bits, &area);
         if (components) contract_components(tables, reflectance, wo, &area, bits, &contracted);
         else contract(tables, reflectance, wo, &area, bits, &contracted);
 #endif
     } else {
         view = footprint(TABLE(Ring, tables, reflectance->view_rings), reflectance->view_count, wo);
-        look_around(TABLE(Level, tables, reflectance->levels), reflectance->level_count, seen->at.u, seen->at.v, wo,
-                    pixel, MOST_PROBES, bits, &area);
+        look_around(tables, reflectance->quilt, TABLE(Level, tables, reflectance->levels), reflectance->level_count,
+                    seen->at.u, seen->at.v, wo, pixel, MOST_PROBES, bits, &area);
         first = view_weights(tables, reflectance, 0, &view, bits);
     }
     int lit = 0;
@@ -144,8 +145,8 @@ static void shade_object(const Place *place, __global const Reflectance *reflect
     // Light from everywhere shows little of what is small: one place is enough.
     const int several = area.count > 1;
     if (several)
-        look_around(TABLE(Level, tables, reflectance->levels), reflectance->level_count, seen->at.u, seen->at.v, wo,
-                    pixel, 1, bits, &area);
+        look_around(tables, reflectance->quilt, TABLE(Level, tables, reflectance->levels), reflectance->level_count,
+                    seen->at.u, seen->at.v, wo, pixel, 1, bits, &area);
 #ifdef HARMONICS
     if (harmonic) {
         if (several && components) contract_components(tables, reflectance, wo, &area, dark, &contracted);

@@ -11,7 +11,7 @@ Test: tests/data/test_eigen_btf.py
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -23,6 +23,7 @@ from torchmeso.data import address, code_stream, mdf, model_writer, pyramid, sto
 from torchmeso.data.btf import horizon_falloff
 from torchmeso.data.mdf import Mdf
 from torchmeso.data.pyramid import Footprint
+from torchmeso.data.quilting_map import QuiltingMap
 from torchmeso.errors import FormatError, ShapeError, check_finite, check_shape
 from torchmeso.geometry import hemisphere, kriging
 from torchmeso.geometry.hemisphere import DirectionSet
@@ -39,6 +40,7 @@ class EigenBtf:
         offset: (rank, 3).
         lights: directions towards the light.
         views: directions towards the viewer.
+        quilting: a larger texture made of the maps' texels, or None: the maps repeat.
     """
 
     maps: Shaped[Tensor, "light H W rank 3"]
@@ -47,6 +49,7 @@ class EigenBtf:
     offset: Float[Tensor, "rank 3"]
     lights: DirectionSet
     views: DirectionSet
+    quilting: QuiltingMap | None = None
 
     def __post_init__(self) -> None:
         """Raise ShapeError unless the parts match."""
@@ -77,13 +80,12 @@ class EigenBtf:
 
     def truncated(self, rank: int) -> "EigenBtf":
         """Return the model with its first `rank` components only."""
-        return EigenBtf(
+        return replace(
+            self,
             maps=self.maps[..., :rank, :],
             weights=self.weights[:, :rank],
             scale=self.scale[:rank],
             offset=self.offset[:rank],
-            lights=self.lights,
-            views=self.views,
         )
 
     def evaluate(
@@ -108,7 +110,7 @@ class EigenBtf:
 
         def look_up(which: Tensor, uv: Tensor, level: int) -> Tensor:
             height, width = self.levels[level].shape[1:3]
-            taps = address.bilinear(uv, height, width)
+            taps = address.of_level(uv, height, width, level, self.quilting)
             node, share = light.node.reshape(-1, 4)[which], light.weight.reshape(-1, 4)[which]
             index = (node[..., :, None] * (height * width) + taps.texel[..., None, :]).flatten(-2)
             weight = (share[..., :, None] * taps.weight[..., None, :]).flatten(-2)
@@ -127,7 +129,7 @@ class EigenBtf:
 
         def look_up(which: Tensor, uv: Tensor, level: int) -> Tensor:
             E = self.ambient_maps[level]
-            taps = address.bilinear(uv, *E.shape[:2])
+            taps = address.of_level(uv, E.shape[0], E.shape[1], level, self.quilting)
             return (E.flatten(0, 1)[taps.texel].to(uv.dtype) * taps.weight[..., None, None]).sum(-3)
 
         return self._weighted(pyramid.average(look_up, uv, seen, *self._size, most=1), wo)

@@ -11,7 +11,7 @@ Test: tests/data/test_mdf.py
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
 from torchmeso.data import address, store
+from torchmeso.data.quilting_map import QuiltingMap
 from torchmeso.data.relief import Relief, from_views
 from torchmeso.errors import ShapeError, check_finite, check_range, check_shape
 from torchmeso.geometry import hemisphere
@@ -38,12 +39,14 @@ class Mdf:
         no_hit: (view, H, W) true where the ray leaves the slab, or None where every entry is a hit.
         directions: the view directions.
         h: slab depth in tile units.
+        quilting: a larger texture made of the table's texels, or None: the table repeats.
     """
 
     delta: Shaped[Tensor, "view H W"]
     no_hit: Bool[Tensor, "view H W"] | None
     directions: DirectionSet
     h: float
+    quilting: QuiltingMap | None = None
 
     def __post_init__(self) -> None:
         """Raise ShapeError or ConfigError unless the parts match."""
@@ -86,7 +89,7 @@ class Mdf:
         self, uv: Float[Tensor, "*batch 2"], wo: Float[Tensor, "*batch 3"]
     ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
         """Return delta, interpolated over the taps that hit, and the weight of the taps that do not."""
-        taps = address.bilinear(uv, *self.texels)
+        taps = address.bilinear(uv, *self.texels, self.quilting)
         view = hemisphere.interpolate(self.directions, wo)
         n_texel = self.delta.shape[1] * self.delta.shape[2]
         index = (view.node[..., :, None] * n_texel + taps.texel[..., None, :]).flatten(-2)
@@ -107,7 +110,8 @@ class Mdf:
         wo = self.directions.directions(torch.float64)[:count]
         drop = self.delta[:count].float() * (self.h / (255 if self.delta.dtype == torch.uint8 else 1))
         no_hit = None if self.no_hit is None else self.no_hit[:count]
-        return from_views(drop, no_hit, (wo[:, :2] / wo[:, 2:]).float(), self.h)
+        found = from_views(drop, no_hit, (wo[:, :2] / wo[:, 2:]).float(), self.h)
+        return found if self.quilting is None else replace(found, quilting=self.quilting)
 
     def distance(self, uv: Float[Tensor, "n 2"], wo: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
         """Return D(uv, wo) by marching through the relief: for the few rays whose answer decides a silhouette."""

@@ -21,6 +21,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchmeso.data import address
+from torchmeso.data.quilting_map import QuiltingMap
 
 REFINEMENT = 4
 """Texels of the relief per texel of the table, along a side."""
@@ -40,15 +41,17 @@ class Relief:
         drop: (H, W) depth below the reference plane in tile units, in [0, h].
         hole: (H, W) true where there is no material, or None where there is material everywhere.
         h: slab depth in tile units.
+        quilting: a larger texture made of the map's texels, or None: the map repeats.
     """
 
     drop: Float[Tensor, "H W"]
     hole: Bool[Tensor, "H W"] | None
     h: float
+    quilting: QuiltingMap | None = None
 
     def depth(self, uv: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch"]:
         """Return the depth of the material straight below `uv`, in tile units; inf in holes."""
-        taps = address.bilinear(uv, self.drop.shape[0], self.drop.shape[1])
+        taps = address.bilinear(uv, self.drop.shape[0], self.drop.shape[1], self.quilting)
         depth = (self.drop.flatten()[taps.texel] * taps.weight).sum(-1)
         if self.hole is None:
             return depth

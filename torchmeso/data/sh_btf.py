@@ -14,7 +14,7 @@ Test: tests/data/test_sh_btf.py
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -27,6 +27,7 @@ from torchmeso.data import address, code_stream, mdf, model_writer, pyramid, sto
 from torchmeso.data.btf import horizon_falloff
 from torchmeso.data.mdf import Mdf
 from torchmeso.data.pyramid import Footprint
+from torchmeso.data.quilting_map import QuiltingMap
 from torchmeso.errors import FormatError, ShapeError, check_finite, check_shape
 from torchmeso.geometry import hemisphere
 from torchmeso.geometry.directions import from_angles, to_angles
@@ -46,6 +47,7 @@ class ShBtf:
         offset: (k_l, k_v, 3).
         lights: directions towards the light that it was fitted to.
         views: directions towards the viewer that it was fitted to.
+        quilting: a larger texture made of the maps' texels, or None: the maps repeat.
     """
 
     maps: Shaped[Tensor, "k_l k_v H W 3"]
@@ -53,6 +55,7 @@ class ShBtf:
     offset: Float[Tensor, "k_l k_v 3"]
     lights: DirectionSet
     views: DirectionSet
+    quilting: QuiltingMap | None = None
 
     def __post_init__(self) -> None:
         """Raise ShapeError or ConfigError unless the parts match."""
@@ -83,13 +86,7 @@ class ShBtf:
     def truncated(self, light_terms: int, view_terms: int) -> "ShBtf":
         """Return the model with its first coefficients only, whole bands: 1, 4, 9, ..."""
         part = slice(light_terms), slice(view_terms)
-        return ShBtf(
-            maps=self.maps[part],
-            scale=self.scale[part],
-            offset=self.offset[part],
-            lights=self.lights,
-            views=self.views,
-        )
+        return replace(self, maps=self.maps[part], scale=self.scale[part], offset=self.offset[part])
 
     def evaluate(
         self,
@@ -133,7 +130,8 @@ class ShBtf:
         scale, offset = (x.to(uv.dtype).flatten(0, 1) for x in (self.scale, self.offset))
 
         def look_up(which: Tensor, uv: Tensor, level: int) -> Tensor:
-            taps = address.bilinear(uv, *self.levels[level].shape[2:4])
+            height, width = self.levels[level].shape[2:4]
+            taps = address.of_level(uv, height, width, level, self.quilting)
             found = [
                 torch.einsum("ptkc,pt,pk,kc->pc", self._texels[level][texel].to(uv.dtype), share, w, scale)
                 for texel, share, w in zip(

@@ -27,6 +27,7 @@ from torchmeso.data import address, mdf, pyramid, store
 from torchmeso.data.btf import horizon_falloff
 from torchmeso.data.mdf import Mdf
 from torchmeso.data.pyramid import Footprint
+from torchmeso.data.quilting_map import QuiltingMap
 from torchmeso.data.sh_btf import basis_everywhere, held_basis
 from torchmeso.errors import FormatError, ShapeError, check_finite, check_shape
 from torchmeso.geometry import hemisphere, triangulation
@@ -47,6 +48,7 @@ class ShPcaBtf:
         lights: directions towards the light that it was fitted to.
         views: directions towards the viewer.
         domain: what the coefficients describe.
+        quilting: a larger texture made of the maps' texels, or None: the maps repeat.
     """
 
     maps: Shaped[Tensor, "view H W rank"]
@@ -56,6 +58,7 @@ class ShPcaBtf:
     lights: DirectionSet
     views: DirectionSet
     domain: Domain = "hemisphere_fit"
+    quilting: QuiltingMap | None = None
 
     def __post_init__(self) -> None:
         """Raise ShapeError or ConfigError unless the parts match."""
@@ -145,7 +148,7 @@ class ShPcaBtf:
 
         def look_up(which: Tensor, uv: Tensor, level: int) -> Tensor:
             height, width = self.levels[level].shape[1:3]
-            taps = address.bilinear(uv, height, width)
+            taps = address.of_level(uv, height, width, level, self.quilting)
             index = (nodes[which][..., None] * (height * width) + taps.texel[..., None, :]).flatten(-2)
             share = (shares[which][..., None] * taps.weight[..., None, :]).flatten(-2)
             return (self._nodes[level][index].to(uv.dtype) * share.unsqueeze(-1)).sum(-2)

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from torchmeso.data import address, image, pyramid
 from torchmeso.data.pyramid import Footprint
+from torchmeso.data.quilting_map import QuiltingMap
 from torchmeso.errors import check_shape
 from torchmeso.geometry.directions import dot, normalize
 from torchmeso.geometry.mesh_file import Finish
@@ -30,10 +31,12 @@ class Textured:
     Attributes:
         albedo: (H, W, 3) linear RGB; 1 x 1 where it is uniform.
         normals: (H2, W2, 3) in the local frame, of any length, or None = (0, 0, 1).
+        quilting: a larger texture made of the pictures' texels, or None: the pictures repeat.
     """
 
     albedo: Float[Tensor, "H W 3"]
     normals: Float[Tensor, "_ _ 3"] | None = None
+    quilting: QuiltingMap | None = None
 
     def __post_init__(self) -> None:
         """Raise ShapeError unless these are pictures."""
@@ -54,19 +57,19 @@ class Textured:
         """
         cosine = dot(self.normal(uv, seen), wi).clamp(min=0)
         lit = torch.where(wi[..., 2] > 0, cosine, 0).unsqueeze(-1)
-        return _look_up(self.albedo_levels, uv, seen) * lit
+        return _look_up(self.albedo_levels, uv, seen, self.quilting) * lit
 
     def ambient(
         self, uv: Float[Tensor, "*batch 2"], wo: Float[Tensor, "*batch 3"], seen: Footprint | None = None
     ) -> Float[Tensor, "*batch 3"]:
         """Return L_a(uv, wo) = (1/pi) times the integral of T over the light hemisphere (white: 1)."""
-        return _look_up(self.albedo_levels, uv, seen) * (0.5 * (1 + self.normal(uv, seen)[..., 2:]))
+        return _look_up(self.albedo_levels, uv, seen, self.quilting) * (0.5 * (1 + self.normal(uv, seen)[..., 2:]))
 
     def normal(self, uv: Float[Tensor, "*batch 2"], seen: Footprint | None = None) -> Float[Tensor, "*batch 3"]:
         """Return the unit normal n(uv) in the local frame."""
         if self.normal_levels is None:
             return torch.tensor([0.0, 0.0, 1.0], dtype=uv.dtype).expand(*uv.shape[:-1], 3)
-        return normalize(_look_up(self.normal_levels, uv, seen))
+        return normalize(_look_up(self.normal_levels, uv, seen, self.quilting))
 
     @cached_property
     def albedo_levels(self) -> list[Float[Tensor, "_ _ 3"]]:
@@ -95,10 +98,10 @@ def from_finish(finish: Finish) -> Textured:
     return Textured(albedo=albedo, normals=normals)
 
 
-def _look_up(levels: list[Tensor], uv: Tensor, seen: Footprint | None) -> Tensor:
+def _look_up(levels: list[Tensor], uv: Tensor, seen: Footprint | None, quilting: QuiltingMap | None) -> Tensor:
     def at(_: Tensor, uv: Tensor, level: int) -> Tensor:
         picture = levels[level]
-        taps = address.bilinear(uv, picture.shape[0], picture.shape[1])
+        taps = address.of_level(uv, picture.shape[0], picture.shape[1], level, quilting)
         return (picture.reshape(-1, 3).to(uv.dtype)[taps.texel] * taps.weight.unsqueeze(-1)).sum(-2)
 
     return pyramid.average(at, uv, seen, max(levels[0].shape[:2]), len(levels))

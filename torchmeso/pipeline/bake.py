@@ -9,7 +9,7 @@ Test: tests/pipeline/test_bake.py
 import hashlib
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,6 +26,7 @@ from torchmeso.data import (
     gdm,
     journal,
     mdf,
+    quilting_map,
     sh_btf,
     sh_pca_btf,
     store,
@@ -35,7 +36,7 @@ from torchmeso.data import (
 from torchmeso.errors import ConfigError, FormatError
 from torchmeso.geometry.mesh_file import Finish
 from torchmeso.meso import bake_btf, bake_gdm, bake_mdf
-from torchmeso.render.scene import Material
+from torchmeso.render.scene import Material, quilted
 
 Report = Callable[[str, float], None]
 """Called with what is being done and the share done, 0..1."""
@@ -80,6 +81,13 @@ def prepare(config: Config, report: Report = silent) -> dict[str, Asset]:
 
 def prepare_material(name: str, material: MaterialConfig, report: Report = silent, *, depth: bool = True) -> Asset:
     """Return one material, baked and compressed or from the cache; without `depth` its MDF stays on disk."""
+    asset = _prepare(name, material, report, depth=depth)
+    if material.quilting is None:
+        return asset
+    return replace(asset, material=quilted(asset.material, quilting_map.load(material.quilting)))
+
+
+def _prepare(name: str, material: MaterialConfig, report: Report, *, depth: bool) -> Asset:
     if material.finish is not None:
         return Asset(material=plain(material.finish), seconds={}, raw_bytes=0, model_bytes=0)
     if material.in_shell:

@@ -19,6 +19,7 @@ from torchmeso.algebra import spherical_harmonics
 from torchmeso.backends import opencl
 from torchmeso.data.eigen_btf import EigenBtf
 from torchmeso.data.mdf import Mdf
+from torchmeso.data.quilting_map import QuiltingMap
 from torchmeso.data.relief import CODES as RELIEF_CODES
 from torchmeso.data.sh_btf import ShBtf
 from torchmeso.data.sh_pca_btf import ShPcaBtf
@@ -44,7 +45,7 @@ REFLECTANCE = np.dtype(
     + [("last_cosine", "f4"), ("albedo", "f4", 3)]
     + [(name, "i4") for name in ("normals", "normal_levels", "normal_level_count")]
     + [(name, "i4") for name in ("light_steps", "light_degree", "view_steps", "view_degree")]
-    + [("view_last_cosine", "f4"), ("view_edges", "i4"), ("pad", "i4")]
+    + [("view_last_cosine", "f4"), ("view_edges", "i4"), ("quilt", "i4")]
 )
 EIGEN, TEXTURED, HARMONIC, HARMONIC_PCA = 1, 2, 3, 4
 """What stands in a reflectance's `there`; 0 = a plain colour."""
@@ -52,7 +53,12 @@ EIGEN, TEXTURED, HARMONIC, HARMONIC_PCA = 1, 2, 3, 4
 MDF = np.dtype(
     [(name, "i4") for name in ("there", "height", "width", "rings", "ring_count", "delta", "missing")]
     + [(name, "i4") for name in ("relief_height", "relief_width", "relief", "hole")]
-    + [("h", "f4"), ("delta_max", "f4"), ("plateau", "i4"), ("pad", "i4", 2)]
+    + [("h", "f4"), ("delta_max", "f4"), ("plateau", "i4"), ("quilt", "i4"), ("pad", "i4")]
+)
+
+QUILT = np.dtype(
+    [(name, "i4") for name in ("height", "width", "source_height", "source_width")]
+    + [("across", "f4"), ("down", "f4"), ("pad", "i4", 10)]
 )
 
 ADDRESSES = {
@@ -72,8 +78,9 @@ ADDRESSES = {
         "light_steps",
         "view_steps",
         "view_edges",
+        "quilt",
     ),
-    MDF: ("rings", "delta", "missing", "relief", "plateau", "hole"),
+    MDF: ("rings", "delta", "missing", "relief", "plateau", "hole", "quilt"),
 }
 """Fields that say on which block a table begins; -1 = there is none."""
 
@@ -87,6 +94,7 @@ class DeviceMaterials(NamedTuple):
         reflectances: (surface,) see `REFLECTANCE`.
         textured: whether any surface has a mesostructure.
         harmonic: whether any surface has a double-SH or SH + PCA BTF.
+        quilted: whether any surface has a quilting map.
         parts: the BTFs and MDFs in `tables`, by identity.
         packed: how many of them were uploaded, not taken over.
     """
@@ -96,6 +104,7 @@ class DeviceMaterials(NamedTuple):
     reflectances: "opencl.Buffer"
     textured: bool
     harmonic: bool
+    quilted: bool
     parts: "dict[tuple[int, bool], _Part]"
     packed: int
 
@@ -145,8 +154,9 @@ def upload_materials(
             mdfs[i] = _placed(parts[id(m.mdf), False])
     textured = bool(mdfs["there"].any())
     harmonic = bool(np.isin(reflectances["there"], (HARMONIC, HARMONIC_PCA)).any())
+    quilted = any(getattr(source, "quilting", None) is not None for source in wanted.values())
     return DeviceMaterials(
-        tables, opencl.upload(mdfs), opencl.upload(reflectances), textured, harmonic, parts, len(new)
+        tables, opencl.upload(mdfs), opencl.upload(reflectances), textured, harmonic, quilted, parts, len(new)
     )
 
 
@@ -172,6 +182,7 @@ def _join(
             record = _harmonic_components(pool, source)
         else:
             record = _pictures(pool, source) if isinstance(source, Textured) else _mdf(pool, source)
+        record["quilt"] = -1 if source.quilting is None else _quilt(pool, source.quilting)
         arrays.append(pool.joined())
         parts[key] = _Part(source, blocks, len(arrays[-1]) // BLOCK, record)
         blocks += parts[key].blocks
@@ -340,6 +351,19 @@ def _pictures(pool: "_Pool", looks: Textured) -> np.ndarray:
         found = _levels_of_four(pool, looks.normal_levels)
         record["normals"], record["normal_levels"], record["normal_level_count"] = found
     return record
+
+
+def _quilt(pool: "_Pool", quilting: QuiltingMap) -> int:
+    """Return where a quilting map begins: its sizes on a block of their own, then row << 16 | column of each texel."""
+    record = np.zeros(1, QUILT)
+    (record["height"], record["width"]), (record["source_height"], record["source_width"]) = (
+        quilting.texels, quilting.source,
+    )  # fmt: skip
+    record["across"], record["down"] = quilting.periods
+    index, columns = quilting.index.numpy(), quilting.source[1]
+    first = pool.add(record)
+    pool.add((index // columns << 16 | index % columns).astype(np.int32))
+    return first
 
 
 def _levels_of_four(pool: "_Pool", levels: list[Float[Tensor, "_ _ 3"]]) -> tuple[int, int, int]:

@@ -113,6 +113,7 @@ class Renderer:
             ("-DONE_LAYER", self._one_layer),
             ("-DMIXED", mixed),
             ("-DHARMONICS", self._on_device.materials.harmonic),
+            ("-DQUILTED", self._on_device.materials.quilted),
             ("-DGDM", self._on_device.shells is not None),
         )
         self._defines = (f"-DSILHOUETTE={mode}", *(name for name, needed in wanted if needed))

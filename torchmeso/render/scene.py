@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchmeso.data.btf import Evaluable
 from torchmeso.data.gdm import Gdm
+from torchmeso.data.quilting_map import QuiltingMap
 from torchmeso.errors import ConfigError, check_range, check_shape
 from torchmeso.geometry import components, frames, shell
 from torchmeso.geometry.camera import Camera
@@ -96,6 +97,23 @@ class Material:
         """Raise ConfigError for a material of two kinds."""
         if self.gdm is not None and (self.btf is not None or self.mdf is not None):
             raise ConfigError("material: expected a GDM alone, or a BTF and an MDF, got both; name two materials")
+
+
+def quilted(material: Material, quilting: QuiltingMap) -> Material:
+    """Return `material` laid out by a quilting map: BTF, MDF and pictures move together.
+
+    Raises:
+        ConfigError: it has nothing that a map could lay out.
+    """
+    parts = {name: part for name in ("btf", "mdf") if (part := getattr(material, name)) is not None}
+    for name, part in parts.items():
+        if not hasattr(part, "quilting"):
+            raise ConfigError(
+                f"quilting: a {type(part).__name__} ({name}) cannot be laid out by a map; compress it first"
+            )
+    if not parts:
+        raise ConfigError("quilting: expected a material with a BTF, an MDF or pictures, got a plain colour or a GDM")
+    return replace(material, **{name: replace(part, quilting=quilting) for name, part in parts.items()})
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)

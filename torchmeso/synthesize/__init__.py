@@ -1,0 +1,1 @@
+"""Synthesis: a small exemplar in, maps that cover any surface out."""
