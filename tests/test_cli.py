@@ -67,6 +67,21 @@ def test_a_weave_file_is_baked(tmp_path):
         assert "'type': 'textile'" in run("info", out).stdout
 
 
+def test_from_a_mesostructure_to_a_gdm_model(tmp_path):
+    table, factored, coded = (tmp_path / name for name in ("a.gdm.zarr", "a.gdm.meso", "b.gdm.meso"))
+    assert run("bake", "--meso", "pipes", "--out", table, "--texels", 6, "--layers", 3).exit_code == 0
+    said = run("compress", table, "--method", "svd", "--rank", 3, "--out", factored).stdout
+    assert re.search(r"a\.gdm\.meso  rank 3  95 % of the hits within \d+\.\d\d voxels", said)
+    assert "rank: 3" in run("info", factored).stdout
+    budget = "--size", "60kB", "--fill", "boundary", "--out", factored, "--force"
+    assert run("compress", table, "--method", "svd", *budget).exit_code == 0
+    assert factored.stat().st_size < 62_000
+    assert run("compress", table, "--method", "coded", "--out", coded).exit_code == 0
+    assert "exact: yes" in run("info", coded).stdout
+    assert "wrong 0.00 %  RMS 0.000 voxels" in run("compare", table, coded).stdout
+    assert json.loads(run("compare", table, factored, "--json").stdout)["wrong"] == 0
+
+
 def test_from_a_mesostructure_to_a_model(tmp_path):
     btf_path, mdf_path, model = tmp_path / "a.btf.zarr", tmp_path / "a.mdf.zarr", tmp_path / "a.meso"
     grid = "grid(4, 2, 80)"
@@ -177,6 +192,16 @@ REFUSED = [
     (["compress", "a", "--colour", "yuv", "--out", "x.meso"], "--method eigen has no --colour"),
     (["compress", "a", "--psnr", "38", "--size", "4MB", "--out", "x.meso"], "--psnr or --size, and not both"),
     (["compress", "a", "--method", "sh-pca", "--storage", "adaptive", "--out", "x.meso"], "has no adaptive steps"),
+    (["compress", "a", "--method", "svd", "--out", "x.meso"], "expected a name that ends in .gdm.meso"),
+    (["compress", "a", "--method", "svd", "--psnr", "3", "--out", "x.gdm.meso"], "--method svd has no --psnr"),
+    (["compress", "a", "--method", "coded", "--rank", "3", "--out", "x.gdm.meso"], "--method coded has no --rank"),
+    (
+        ["compress", "a", "--method", "svd", "--rank", "3", "--size", "1MB", "--out", "x.gdm.meso"],
+        "one of --rank, --si",
+    ),
+    (["compress", "a", "--fill", "hits", "--out", "x.meso"], "--method eigen has no --fill"),
+    (["compress", "a.gdm.zarr", "--method", "svd", "--out", "x.gdm.meso"], "expected a gdm table, found none"),
+    (["compare", "a.gdm.zarr", "b.gdm.meso", "--out", "x.png"], "a GDM has none"),
     (["compress", "a", "--unbounded", "--out", "x.meso"], "--method eigen has no --unbounded"),
     (["compress", "a", "--ridge", "0", "--out", "x.meso"], "--method eigen has no --ridge"),
     (["compress", "a", "--method", "double-sh", "--rank", "3", "--out", "x.meso"], "double-sh has no --rank"),

@@ -284,13 +284,16 @@ def export(file: str, out: str, method: Any, rank: int | None, force: bool) -> N
 @click.option("--out", help="Picture (.png): of two pictures four times their difference, of BTFs PSNR by direction.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON for machines.")
 def compare(a: str, b: str, out: str | None, as_json: bool) -> None:
-    """Compare picture B with its reference A: PSNR, SSIM, FLIP, largest error; or BTF model B with its table A."""
+    """Compare picture B with its reference A: PSNR, SSIM, FLIP, largest error; or model B with its table A."""
     from dataclasses import asdict
 
     from torchmeso import quality
     from torchmeso.data import image
-    from torchmeso.pipeline import directional_error
+    from torchmeso.pipeline import directional_error, gdm_difference
 
+    if gdm_difference.is_gdm(a):
+        _compare_gdm(a, b, out, as_json)
+        return
     if directional_error.is_btf(a):
         _compare_btf(a, b, out, as_json)
         return
@@ -303,6 +306,22 @@ def compare(a: str, b: str, out: str | None, as_json: bool) -> None:
         return
     flip = "flip not installed" if found.flip is None else f"FLIP {found.flip:.4f}"
     click.echo(f"PSNR {found.psnr:.2f} dB  SSIM {found.ssim:.4f}  {flip}  max error {found.max_error:.4g}")
+
+
+def _compare_gdm(a: str, b: str, out: str | None, as_json: bool) -> None:
+    from dataclasses import asdict
+
+    from torchmeso.pipeline import gdm_difference
+
+    if out is not None:
+        raise ConfigError("compare: --out draws the difference of pictures and BTFs; a GDM has none")
+    found = gdm_difference.compare(a, b)
+    click.echo(
+        json.dumps(asdict(found))
+        if as_json
+        else f"hit or miss wrong {100 * found.wrong:.2f} %  RMS {found.rms:.3f} voxels  95 % within {found.p95:.3f}  "
+        f"max error {found.max_error:.3g}"
+    )
 
 
 def _compare_btf(a: str, b: str, out: str | None, as_json: bool) -> None:

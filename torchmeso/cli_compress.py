@@ -18,17 +18,28 @@ from torchmeso.errors import ConfigError
 @click.option(
     "--method",
     default="eigen",
-    type=click.Choice(["eigen", "double-sh", "sh-pca", "transform", "factored", "ptm", "hsh"]),
+    type=click.Choice(["eigen", "double-sh", "sh-pca", "transform", "factored", "ptm", "hsh", "svd", "coded"]),
     show_default=True,
     help="Kind of model; transform: the smallest file, to --psnr or --size; factored: as Bonn's DFMF; "
-    "ptm and hsh: of an RTI set (.lp).",
+    "ptm and hsh: of an RTI set (.lp); svd, coded: of a GDM (.gdm.zarr), by factors or by an exact code.",
 )
 @click.option("--psnr", type=float, help="eigen, double-sh, transform: least PSNR of the values of T, in dB.")
-@click.option("--size", help="The same: most bytes of the file without an MDF: 4MB, 300kB, 65536.")
+@click.option("--size", help="The same, and svd: most bytes of the file without an MDF: 4MB, 300kB, 65536.")
+@click.option(
+    "--error",
+    type=float,
+    help="svd: most voxels that 95 % of the hits are off by, in place of a rank; coded: that any is [0].",
+)
+@click.option(
+    "--fill",
+    type=click.Choice(["hits", "boundary"]),
+    help="svd: fit what hits alone [hits], or the way out of the slab where a ray leaves as wang2004gdm does.",
+)
 @click.option(
     "--rank",
     type=int,
-    help="eigen: components kept, at most the number of views [4]; sh-pca, factored [16]; the most for a budget [all].",
+    help="eigen: components kept, at most the number of views [4]; sh-pca, factored, svd [16]; "
+    "the most for a budget [all].",
 )
 @click.option(
     "--light-terms",
@@ -64,7 +75,7 @@ from torchmeso.errors import ConfigError
 )
 @click.option("--mdf", "silhouette", help="MDF table (.mdf.zarr) to pack into the model.")
 @click.option("--allow-missing", is_flag=True, help="Interpolate pictures that a folder or zip lacks.")
-@click.option("--out", required=True, help="The run-time model (.meso); of ptm .ptm, of hsh .rti.")
+@click.option("--out", required=True, help="The run-time model (.meso; of a GDM .gdm.meso); of ptm .ptm, of hsh .rti.")
 @click.option("--force", is_flag=True, help="Replace an existing model.")
 def compress(
     table: str,
@@ -76,7 +87,10 @@ def compress(
     force: bool,
     **options: Any,
 ) -> None:
-    """Compress a BTF TABLE (.btf.zarr or .btf, a folder or zip of pictures, or an RTI set .lp) into a small model."""
+    """Compress a BTF or GDM TABLE into a small model.
+
+    A BTF is a .btf.zarr or .btf, a folder or zip of pictures, or an RTI set (.lp); a GDM is a .gdm.zarr.
+    """
     from torchmeso.compress import factored, stream, transform
     from torchmeso.compress.budget import Budget
     from torchmeso.data import factored_btf, journal, mdf, transform_btf
@@ -85,6 +99,9 @@ def compress(
 
     if method in ("ptm", "hsh"):
         _relight(table, method, out, force, {**options, "unbounded": unbounded})
+        return
+    if method in ("svd", "coded"):
+        _gdm(table, method, out, force, {**options, "unbounded": unbounded, "mdf": silhouette})
         return
     if not out.endswith(".meso"):
         raise ConfigError(f"{out}: expected a name that ends in .meso")
@@ -167,3 +184,36 @@ def _relight(lights: str, method: Any, out: str, force: bool, options: dict[str,
     refuse_to_replace(out, force)
     relight.fit(lights, out, method=method, terms=options["terms"], per_channel=options["per_channel"])
     click.echo(out)
+
+
+def _gdm(table: str, method: str, out: str, force: bool, options: dict[str, Any]) -> None:
+    """Write a factored or a coded GDM, and say what it is."""
+    from torchmeso.compress import gdm_svd as fits
+    from torchmeso.compress.budget import parse_size
+    from torchmeso.data import gdm, gdm_coded, gdm_svd
+
+    own = {"storage", "error"} | ({"rank", "size", "fill"} if method == "svd" else set())  # storage has a default
+    given = {name: value for name, value in options.items() if value not in (None, False)}
+    if wrong := sorted(set(given) - own):
+        raise ConfigError(f"compress: --method {method} has no --{wrong[0].replace('_', '-')}")
+    if not out.endswith(".gdm.meso"):
+        raise ConfigError(f"{out}: expected a name that ends in .gdm.meso, which is how configurations know a GDM")
+    if len(set(given) & {"rank", "size", "error"}) > 1:
+        raise ConfigError("compress: expected one of --rank, --size and --error")
+    refuse_to_replace(out, force)
+    source = gdm.load(table)
+    if method == "coded":
+        gdm_coded.save(source, out, within=given.get("error", 0.0))
+        click.echo(out)
+        return
+    fill = given.get("fill", "hits")
+    with progress() as report:
+        told = partial(report, "GDM")
+        if "size" in given or "error" in given:
+            size = parse_size(given["size"]) if "size" in given else None
+            found = fits.fit_to(source, size=size, within=given.get("error"), fill=fill, progress=told)
+        else:
+            found = fits.fit(source, fits.GdmSvdOptions(rank=given.get("rank", 16), fill=fill), progress=told)
+    off = fits.error(source, found)
+    gdm_svd.save(found, out, error=round(off, 3))
+    click.echo(f"{out}  rank {found.rank}  95 % of the hits within {off:.2f} voxels")

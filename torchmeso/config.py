@@ -86,14 +86,18 @@ class MesoConfig(BaseModel):
         return _call("meso", SOURCES[self.type], self.arguments)
 
 
+GDMS = (".gdm.zarr", ".gdm.meso")
+"""How files end that hold a GDM."""
+
+
 class MaterialConfig(_Strict):
     """A mesostructure with how to bake and compress it; or a finished model; or a plain colour with pictures.
 
     A BTF becomes an eigen BTF, or a double-SH BTF where `double_sh` is given, or an SH + PCA BTF where `sh_pca` is.
     `rank` reads only that many components of a model; the others stay on disk. `albedo` multiplies `albedo_map`.
     With `gdm` the mesostructure stands as material of any form in a `shell` instead, above a `floor` of that colour; a
-    `model` may be a baked GDM (.gdm.zarr) too. `quilting` is a map (.quilt) that lays out BTF, MDF and pictures;
-    texture coordinates stay those of the exemplar.
+    `model` may be a GDM too, as baked (.gdm.zarr) or compressed (.gdm.meso). `quilting` is a map (.quilt) that lays
+    out BTF, MDF and pictures; texture coordinates stay those of the exemplar.
     """
 
     meso: MesoConfig | None = None
@@ -127,7 +131,7 @@ class MaterialConfig(_Strict):
         if self.gdm is not None and self.meso is None:
             raise ValueError("'gdm' says how to bake a 'meso'; it has none")
         if self.model_fields_set & {"shell", "floor"} and not self.in_shell:
-            raise ValueError("'shell' and 'floor' belong to a 'gdm' or to a 'model' that is one (.gdm.zarr)")
+            raise ValueError("'shell' and 'floor' belong to a 'gdm' or to a 'model' that is one (.gdm.zarr, .gdm.meso)")
         if self.quilting is not None and (self.in_shell or (plain and not (self.albedo_map or self.normal_map))):
             raise ValueError("'quilting' lays out a BTF, an MDF or pictures; a GDM and a plain colour have none")
         if self.rank is not None and self.model is None:
@@ -137,7 +141,7 @@ class MaterialConfig(_Strict):
     @property
     def in_shell(self) -> bool:
         """Whether it is a GDM."""
-        return self.gdm is not None or (self.model is not None and self.model.rstrip("/").endswith(".gdm.zarr"))
+        return self.gdm is not None or (self.model is not None and self.model.rstrip("/").endswith(GDMS))
 
     @property
     def finish(self) -> Finish | None:

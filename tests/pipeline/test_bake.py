@@ -4,9 +4,10 @@ import pytest
 import torch
 
 from tests.pipeline.small import small
+from torchmeso.compress import gdm_svd as fits
 from torchmeso.compress.double_sh import DoubleShOptions
 from torchmeso.compress.sh_pca import ShPcaOptions
-from torchmeso.data import store
+from torchmeso.data import gdm_coded, gdm_svd, store
 from torchmeso.errors import ConfigError, FormatError
 from torchmeso.pipeline import bake, render
 
@@ -189,3 +190,11 @@ def test_a_material_in_a_shell_is_a_gdm(cache, tmp_path):
     assert given.material.shell.base == "open"
     assert given.material.gdm.voxels == (6, 16, 16)
     assert given.raw_bytes == 0
+    table, packed = given.material.gdm, tmp_path / "weave.gdm.meso"
+    gdm_coded.save(table, packed)
+    coded = bake.prepare(in_shells({"model": str(packed), "floor": [0.1, 0.1, 0.1]}))["weave"]
+    assert torch.equal(coded.material.gdm.distance, table.distance)
+    assert coded.model_bytes == packed.stat().st_size < given.model_bytes
+    gdm_svd.save(fits.fit(table, fits.GdmSvdOptions(rank=4)), packed)
+    factored = bake.prepare(in_shells({"model": str(packed), "rank": 2}))["weave"]
+    assert torch.equal(factored.material.gdm.left, table.left)

@@ -3,7 +3,7 @@
 Test: tests/bench/test_gdm.py
 """
 
-from torchmeso.bench import gdm_bake, gdm_error, gdm_speed
+from torchmeso.bench import gdm_bake, gdm_error, gdm_speed, gdm_tables
 from torchmeso.bench.suite import Measurement
 
 MEASUREMENTS = [
@@ -16,5 +16,6 @@ MEASUREMENTS = [
     Measurement("slices", gdm_speed.slices),
     Measurement("distance", gdm_error.distance),
     Measurement("silhouette", gdm_error.silhouette),
+    Measurement("tables", gdm_tables.tables),
     Measurement("distortion", gdm_error.distortion),
 ]

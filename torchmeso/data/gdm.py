@@ -17,35 +17,14 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Shaped
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
-from torchmeso.data import address, store
+from torchmeso.data import gdm_query, store
+from torchmeso.data.gdm_query import Query
 from torchmeso.errors import ShapeError, check_finite, check_range, check_shape
 from torchmeso.geometry import sphere
 from torchmeso.geometry.sphere import SphereGrid
-
-LEVEL = 1e-12
-"""Rays that climb by less per unit of way never leave the slab."""
-
-
-APART = 4.0
-"""Voxels between distances that are not of one surface."""
-
-
-class Query(NamedTuple):
-    """What a ray meets.
-
-    Attributes:
-        distance: (...) way to the material, or to where the table ends for a ray that meets none.
-        left: (...) whether it meets none until there.
-        near: (...) way to the nearest surface that samples tell of, fewer than half of them where `left`; inf where
-            there is none.
-    """
-
-    distance: Float[Tensor, "*batch"]
-    left: Bool[Tensor, "*batch"]
-    near: Float[Tensor, "*batch"]
 
 
 class Matter(NamedTuple):
@@ -110,8 +89,7 @@ class Gdm:
     @property
     def voxel(self) -> float:
         """The longest side of a voxel, tile units."""
-        layers, height, width = self.voxels
-        return max(1 / width, 1 / height, self.h / (layers - 1))
+        return gdm_query.voxel_side(self)
 
     @property
     def directions(self) -> SphereGrid:
@@ -128,53 +106,37 @@ class Gdm:
         Returns:
             distances in tile units; 0 inside solid.
         """
-        voxel, weight, away = self._corners(place)
-        toward = self.directions.interpolate(w)
-        tables = self._rows
-        index = voxel[..., :, None] * tables.distance.shape[1] + toward.node[..., None, :]
-        solid = tables.solid[voxel]
-        inside = (weight * solid).sum(-1) > 0.5
-        ahead = (away * w[..., None, :]).sum(-1)
-        share = ((weight * (1 - solid))[..., :, None] * toward.weight[..., None, :]).flatten(-2)
-        met = 1 - tables.left.flatten()[index].to(share.dtype).flatten(-2)
-        hits, misses = (share * met).sum(-1), (share * (1 - met)).sum(-1)
-        found = tables.distance.flatten()[index].to(share.dtype)
+        return gdm_query.query(self, place, w)
+
+    def samples(
+        self, voxel: Int[Tensor, "*batch 8"], node: Int[Tensor, "*batch 4"], dtype: torch.dtype
+    ) -> tuple[Float[Tensor, "*batch 8 4"], Float[Tensor, "*batch 8 4"]]:
+        """Return the distances in the table, tile units, and 1 where they are of a hit.
+
+        Args:
+            voxel: (layer * H + row) * W + column.
+            node: of `SphereGrid.interpolate`.
+            dtype: of what is returned.
+        """
+        rows = self._rows
+        index = voxel[..., :, None] * rows.distance.shape[1] + node[..., None, :]
+        found = rows.distance.flatten()[index].to(dtype)
         if self.distance.dtype == torch.uint8:
             found = found * (self.cap / 255)
-        carried, first = self._of_one_surface((found + ahead.unsqueeze(-1)).flatten(-2), share * met, hits)
-        # A ray towards corners inside solid meets something, though its neighbours that start outside may pass.
-        before = weight * solid * (ahead > 0)
-        blocks = before.sum(-1)
-        at_corner = (before * ahead).sum(-1) / blocks.clamp(min=1e-12)
-        distance, first = (torch.where(hits > 1e-6, x, at_corner) for x in (carried, first))
-        hits = hits + blocks
-        end = self.boundary(place, w)
-        left = ~inside & (misses >= hits)
-        distance = torch.minimum(distance.clamp(min=0), end)
-        near = torch.where(hits > 1e-6, torch.minimum(first.clamp(min=0), distance), torch.inf)
-        return Query(torch.where(inside, 0, torch.where(left, end, distance)), left, near)
+        return found, 1 - rows.left.flatten()[index].to(dtype)
 
-    def _of_one_surface(self, carried: Tensor, share: Tensor, hits: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the mean of distances, twice; of two surfaces that of the larger share, and the first one's."""
-        total = (share * carried).sum(-1)
-        mean = total / hits.clamp(min=1e-12)
-        near = share * (carried <= mean.unsqueeze(-1))
-        nearer, before = near.sum(-1), (near * carried).sum(-1)
-        farther = hits - nearer
-        first, second = before / nearer.clamp(min=1e-12), (total - before) / farther.clamp(min=1e-12)
-        two = (second - first > APART * self.voxel) & (nearer > 1e-6) & (farther > 1e-6)
-        return torch.where(two, torch.where(nearer >= farther, first, second), mean), torch.where(two, first, mean)
+    @property
+    def solid(self) -> Float[Tensor, "voxel"]:
+        """1 where a voxel is inside of material."""
+        return self._rows.solid
 
     def boundary(self, place: Float[Tensor, "*batch 3"], w: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         """Return the way along `w` to the top or bottom of the slab, at most `cap`."""
-        z = place[..., 2].clamp(-self.h, 0)
-        climb = w[..., 2]
-        way = torch.where(climb > 0, -z, -(z + self.h)) / torch.where(climb.abs() < LEVEL, 1, climb)
-        return torch.where(climb.abs() < LEVEL, self.cap, way).clamp(0, self.cap)
+        return gdm_query.boundary(self, place, w)
 
     def matter_at(self, place: Float[Tensor, "*batch 3"]) -> Matter:
         """Return the material around `place`, from the corners that have one; the normal is up where none has."""
-        voxel, weight, _ = self._corners(place)
+        voxel, weight, _ = gdm_query.corners(self, place)
         rows = self.matter.reshape(-1, 10).to(place.dtype)[voxel]
         known = weight * (rows[..., 6] > 0)
         mean = (known.unsqueeze(-1) * rows).sum(-2) / known.sum(-1, keepdim=True).clamp(min=1e-12)
@@ -183,26 +145,6 @@ class Gdm:
         up = torch.tensor([0.0, 0.0, 1.0], dtype=place.dtype).expand_as(normal)
         normal = torch.where(length > 1e-6, normal / length.clamp(min=1e-6), up)
         return Matter(normal, mean[..., 3:6], mean[..., 6].clamp(min=0.02), mean[..., 7:])
-
-    def _corners(self, place: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the eight voxels around `place`, their weights, and the ways from `place` to them, tile units."""
-        layers, height, width = self.voxels
-        taps = address.bilinear(place[..., :2], height, width)
-        x = (place[..., 0] - place[..., 0].detach().floor()) * width - 0.5
-        y = (1 - (place[..., 1] - place[..., 1].detach().floor())) * height - 0.5
-        fx, fy = x - x.detach().floor(), y - y.detach().floor()
-        z = ((place[..., 2] + self.h) * ((layers - 1) / self.h)).clamp(0, layers - 1)
-        below = z.detach().floor().clamp(max=layers - 2)
-        fz = z - below
-        plane = height * width
-        lower = below.long().unsqueeze(-1) * plane + taps.texel
-        voxel = torch.cat([lower, lower + plane], -1)
-        weight = torch.cat([taps.weight * (1 - fz).unsqueeze(-1), taps.weight * fz.unsqueeze(-1)], -1)
-        step = self.h / (layers - 1)
-        columns = torch.stack([-fx, 1 - fx, -fx, 1 - fx] * 2, -1) / width
-        rows = torch.stack([fy, fy, fy - 1, fy - 1] * 2, -1) / height
-        heights = torch.stack([-fz] * 4 + [1 - fz] * 4, -1) * step
-        return voxel, weight, torch.stack([columns, rows, heights], -1)
 
     @cached_property
     def _rows(self) -> "_Rows":

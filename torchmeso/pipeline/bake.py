@@ -24,6 +24,8 @@ from torchmeso.data import (
     eigen_btf,
     factored_btf,
     gdm,
+    gdm_coded,
+    gdm_svd,
     journal,
     mdf,
     quilting_map,
@@ -112,9 +114,26 @@ def _prepare_gdm(name: str, material: MaterialConfig, report: Report) -> Asset:
     """Return a material in a shell: its GDM baked, from the cache, or as it is given."""
     seconds: dict[str, float] = {}
     path = Path(material.model) if material.model is not None else bake_tables(name, material, report, seconds)[0]
-    table = Material(gdm=gdm.load(path), shell=material.shell, albedo=material.floor)
-    size = _size_on_disk(path)
+    table = Material(gdm=open_gdm(path, rank=material.rank), shell=material.shell, albedo=material.floor)
+    size = path.stat().st_size if path.is_file() else _size_on_disk(path)
     return Asset(material=table, seconds=seconds, raw_bytes=size if material.model is None else 0, model_bytes=size)
+
+
+def open_gdm(path: str | Path, *, rank: int | None = None) -> gdm.Gdm:
+    """Return the direct table in a raw table (.gdm.zarr), or what a run-time model (.gdm.meso) stands for.
+
+    Args:
+        path: the file.
+        rank: components of a factored GDM to read; all of them where it is None.
+
+    Raises:
+        FormatError: the file is missing, damaged, or holds no GDM.
+    """
+    if not str(path).endswith(".meso"):
+        return gdm.load(path)
+    if "coded" in store.Model(path).meta:
+        return gdm_coded.load(path)
+    return gdm_svd.load(path, rank=rank).expanded()
 
 
 def _compress(name: str, btf_table: Path, mdf_table: Path, material: MaterialConfig, out: Path, report: Report) -> None:

@@ -165,6 +165,9 @@ def _model(path: Path) -> dict[str, Any]:
         for kind, told in kinds.items():
             if kind in model.meta:
                 about |= {**told(model), **_psnr(model), "BTF data": _held(model, f"{kind}.")}
+        for kind, told in {"svd": _factored_gdm, "coded": _coded_gdm}.items():
+            if kind in model.meta:
+                about |= {**told(model), "distances": _held(model, f"{kind}."), "bits, material": _held(model, "gdm.")}
         if "mdf" in model.meta:
             about["MDF"] = f"{model.meta['mdf']['directions']}, h = {model.meta['mdf']['h']:g} tiles"
             about["MDF data"] = _held(model, "mdf.")
@@ -207,6 +210,29 @@ def _factored(model: store.Model) -> dict[str, Any]:
         "lights": factored["lights"],
         "views": factored["views"],
         "texels": f"{texels[1]} x {texels[0]}",
+    }
+
+
+def _factored_gdm(model: store.Model) -> dict[str, Any]:
+    return {"rank": model.meta["svd"]["rank"], **_slab(model.meta["svd"])}
+
+
+def _coded_gdm(model: store.Model) -> dict[str, Any]:
+    step = model.meta["coded"]["step"]
+    return {
+        "exact": "yes" if step == 1 else f"to {step / 2:g} / 255 of the longest distance",
+        **_slab(model.meta["coded"]),
+    }
+
+
+def _slab(about: dict[str, Any]) -> dict[str, Any]:
+    """Return what GDMs of all forms have."""
+    layers, height, width = about["voxels"]
+    return {
+        "voxels": f"{width} x {height} x {layers}",
+        "directions": f"{about['n_theta']} x {about['n_phi']}",
+        "slab depth (tiles)": about["h"],
+        "longest distance (tiles)": about["cap"],
     }
 
 

@@ -1,0 +1,145 @@
+"""How a generalised displacement map is asked, whatever form its samples are kept in.
+
+wang2004gdm, section 3.1. Eight voxels around a point times four directions around a ray are samples, each of one of
+three cases: a hit, `left`, or inside solid. Which case a query is is decided by weight; the samples of that case alone
+are averaged. `data.gdm` says what the cases are and how distances are carried to the point.
+
+Test: tests/data/test_gdm.py
+"""
+
+from typing import NamedTuple, Protocol
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchmeso.data import address
+from torchmeso.geometry.sphere import SphereGrid
+
+LEVEL = 1e-12
+"""Rays that climb by less per unit of way never leave the slab."""
+
+APART = 4.0
+"""Voxels between distances that are not of one surface."""
+
+
+class Query(NamedTuple):
+    """What a ray meets.
+
+    Attributes:
+        distance: (...) way to the material, or to where the table ends for a ray that meets none.
+        left: (...) whether it meets none until there.
+        near: (...) way to the nearest surface that samples tell of, fewer than half of them where `left`; inf where
+            there is none.
+    """
+
+    distance: Float[Tensor, "*batch"]
+    left: Bool[Tensor, "*batch"]
+    near: Float[Tensor, "*batch"]
+
+
+class Sampled(Protocol):
+    """Samples over voxels and directions: `data.gdm.Gdm`, or `data.gdm_svd.GdmSvd`."""
+
+    @property
+    def h(self) -> float:
+        """Slab depth, tile units."""
+        ...
+
+    @property
+    def cap(self) -> float:
+        """Longest distance, tile units."""
+        ...
+
+    @property
+    def voxels(self) -> tuple[int, int, int]:
+        """Layers, height and width."""
+        ...
+
+    @property
+    def directions(self) -> SphereGrid:
+        """The directions of travel."""
+        ...
+
+    @property
+    def solid(self) -> Float[Tensor, "voxel"]:
+        """1 where a voxel is inside of material."""
+        ...
+
+    def samples(
+        self, voxel: Int[Tensor, "*batch 8"], node: Int[Tensor, "*batch 4"], dtype: torch.dtype
+    ) -> tuple[Float[Tensor, "*batch 8 4"], Float[Tensor, "*batch 8 4"]]:
+        """Return distances in tile units, and 1 where they are of a hit."""
+        ...
+
+
+def query(table: Sampled, place: Float[Tensor, "*batch 3"], w: Float[Tensor, "*batch 3"]) -> Query:
+    """Return how far it is from `place` along `w` to material; see `Gdm.evaluate`."""
+    voxel, weight, away = corners(table, place)
+    toward = table.directions.interpolate(w)
+    solid = table.solid[voxel]
+    inside = (weight * solid).sum(-1) > 0.5
+    ahead = (away * w[..., None, :]).sum(-1)
+    share = ((weight * (1 - solid))[..., :, None] * toward.weight[..., None, :]).flatten(-2)
+    found, met = (x.flatten(-2) for x in table.samples(voxel, toward.node, share.dtype))
+    hits, misses = (share * met).sum(-1), (share * (1 - met)).sum(-1)
+    carried = found + ahead.unsqueeze(-1).expand(*ahead.shape, 4).flatten(-2)
+    of_one, first = _of_one_surface(carried, share * met, hits, APART * voxel_side(table))
+    # A ray towards corners inside solid meets something, though its neighbours that start outside may pass.
+    before = weight * solid * (ahead > 0)
+    blocks = before.sum(-1)
+    at_corner = (before * ahead).sum(-1) / blocks.clamp(min=1e-12)
+    distance, first = (torch.where(hits > 1e-6, x, at_corner) for x in (of_one, first))
+    hits = hits + blocks
+    end = boundary(table, place, w)
+    left = ~inside & (misses >= hits)
+    distance = torch.minimum(distance.clamp(min=0), end)
+    near = torch.where(hits > 1e-6, torch.minimum(first.clamp(min=0), distance), torch.inf)
+    return Query(torch.where(inside, 0, torch.where(left, end, distance)), left, near)
+
+
+def _of_one_surface(carried: Tensor, share: Tensor, hits: Tensor, apart: float) -> tuple[Tensor, Tensor]:
+    """Return the mean of distances, twice; of two surfaces that of the larger share, and the first one's."""
+    total = (share * carried).sum(-1)
+    mean = total / hits.clamp(min=1e-12)
+    near = share * (carried <= mean.unsqueeze(-1))
+    nearer, before = near.sum(-1), (near * carried).sum(-1)
+    farther = hits - nearer
+    first, second = before / nearer.clamp(min=1e-12), (total - before) / farther.clamp(min=1e-12)
+    two = (second - first > apart) & (nearer > 1e-6) & (farther > 1e-6)
+    return torch.where(two, torch.where(nearer >= farther, first, second), mean), torch.where(two, first, mean)
+
+
+def voxel_side(table: Sampled) -> float:
+    """Return the longest side of a voxel, tile units."""
+    layers, height, width = table.voxels
+    return max(1 / width, 1 / height, table.h / (layers - 1))
+
+
+def boundary(table: Sampled, place: Float[Tensor, "*batch 3"], w: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+    """Return the way along `w` to the top or bottom of the slab, at most `cap`."""
+    z = place[..., 2].clamp(-table.h, 0)
+    climb = w[..., 2]
+    way = torch.where(climb > 0, -z, -(z + table.h)) / torch.where(climb.abs() < LEVEL, 1, climb)
+    return torch.where(climb.abs() < LEVEL, table.cap, way).clamp(0, table.cap)
+
+
+def corners(table: Sampled, place: Float[Tensor, "*batch 3"]) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the eight voxels around `place`, their weights, and the ways from `place` to them, tile units."""
+    layers, height, width = table.voxels
+    taps = address.bilinear(place[..., :2], height, width)
+    x = (place[..., 0] - place[..., 0].detach().floor()) * width - 0.5
+    y = (1 - (place[..., 1] - place[..., 1].detach().floor())) * height - 0.5
+    fx, fy = x - x.detach().floor(), y - y.detach().floor()
+    z = ((place[..., 2] + table.h) * ((layers - 1) / table.h)).clamp(0, layers - 1)
+    below = z.detach().floor().clamp(max=layers - 2)
+    fz = z - below
+    plane = height * width
+    lower = below.long().unsqueeze(-1) * plane + taps.texel
+    voxel = torch.cat([lower, lower + plane], -1)
+    weight = torch.cat([taps.weight * (1 - fz).unsqueeze(-1), taps.weight * fz.unsqueeze(-1)], -1)
+    step = table.h / (layers - 1)
+    columns = torch.stack([-fx, 1 - fx, -fx, 1 - fx] * 2, -1) / width
+    rows = torch.stack([fy, fy, fy - 1, fy - 1] * 2, -1) / height
+    heights = torch.stack([-fz] * 4 + [1 - fz] * 4, -1) * step
+    return voxel, weight, torch.stack([columns, rows, heights], -1)
