@@ -71,7 +71,7 @@ def test_a_budget_is_kept_and_not_wasted(weave):
     assert gdm_svd.error(weave, gdm_svd.fit(weave, GdmSvdOptions(rank=close.rank - 1))) > 0.15
 
 
-@pytest.mark.parametrize("level", [-0.5, 0.1])
+@pytest.mark.parametrize("level", [-5.0, 0.1])
 def test_empty_and_solid_volumes_are_fitted(level):
     table = layered(level)
     found = gdm_svd.fit(table, GdmSvdOptions(rank=2))

@@ -3,10 +3,13 @@ import torch
 
 from tests.tolerances import FLOAT64
 from torchmeso.data import gdm as gdm_module
+from torchmeso.data import gdm_query
 from torchmeso.data.gdm import Gdm
 from torchmeso.errors import ConfigError, FormatError, ShapeError
 from torchmeso.geometry.directions import normalize
 from torchmeso.geometry.sphere import SphereGrid
+from torchmeso.meso import bake_gdm, generators
+from torchmeso.meso.bake_gdm import GdmOptions, RayCastGdm
 
 GRID = SphereGrid(n_theta=6, n_phi=8)
 H = 0.4
@@ -84,6 +87,45 @@ def test_bytes_are_as_good_as_their_step(rng):
     a, b = exact.evaluate(place, w), coarse.evaluate(place, w)
     assert torch.equal(a.left, b.left)
     assert (a.distance - b.distance).abs().max() <= 0.51 * exact.cap / 255 + 1e-9
+
+
+def test_the_safe_way_ends_before_a_plane(rng):
+    """However steep its neighbours are; and where it is short, that is by the size of a cell."""
+    level = -0.27
+    gdm = layered(level)
+    place, w = points(4000, rng)
+    outside = place[:, 2] > level
+    safe = gdm_query.safe_way(gdm, place, w)
+    truth = torch.where(w[:, 2] < 0, (level - place[:, 2]) / w[:, 2], torch.inf)
+    assert (safe[outside] <= truth[outside] + 1e-9).all()
+    assert (safe >= 0).all()
+    near = outside & (truth < gdm.cap / 4)
+    assert (truth - safe)[near].mean() < 0.5 * gdm.voxel
+
+
+def test_rays_asked_again_end_closer_to_the_material(rng):
+    meso = generators.pipes()
+    gdm = bake_gdm.in_memory(meso, GdmOptions(texels=16, layers=8, n_theta=8, n_phi=12))
+    rays = RayCastGdm(meso, gdm.cap)
+    place = torch.rand(3000, 3, generator=rng)
+    place[:, 2] *= -gdm.h
+    place = place[~rays.inside(place)]
+    w = normalize(torch.randn(len(place), 3, generator=rng))
+    t, _ = rays.cast(place, w, torch.zeros(len(place), dtype=torch.bool))
+    meets = t < gdm.boundary(place, w)
+    found = [gdm_query.approach(gdm, place.double(), w.double(), queries=n) for n in (1, 2, 16)]
+    once = gdm.evaluate(place.double(), w.double())
+    assert all(torch.equal(a, b) for a, b in zip(found[0], once, strict=True))
+    off = [float((x.distance - t).abs()[meets & ~x.left].quantile(0.9)) for x in found]
+    assert off[2] < off[1] < off[0]
+
+
+def test_rays_that_meet_nothing_go_to_the_end(rng):
+    gdm = layered(-5.0)  # farther below than the longest distance
+    place, w = points(200, rng)
+    found = gdm_query.approach(gdm, place, w, queries=8)
+    assert found.left.all()
+    torch.testing.assert_close(found.distance, gdm.boundary(place, w), **FLOAT64)
 
 
 def test_gradient_moves_the_hit_with_the_point(rng):

@@ -15,6 +15,7 @@ MEASUREMENTS = [
     Measurement("leaks", gdm_speed.leaks),
     Measurement("slices", gdm_speed.slices),
     Measurement("distance", gdm_error.distance),
+    Measurement("refined", gdm_error.refined),
     Measurement("silhouette", gdm_error.silhouette),
     Measurement("tables", gdm_tables.tables),
     Measurement("distortion", gdm_error.distortion),

@@ -13,6 +13,7 @@ from torch import Tensor
 from torchmeso import quality
 from torchmeso.bench.gdm_speed import SIZE, camera_entries, table, view
 from torchmeso.bench.suite import Context, Row
+from torchmeso.data import gdm_query
 from torchmeso.data.gdm import Gdm
 from torchmeso.geometry import shapes
 from torchmeso.geometry.directions import normalize
@@ -60,7 +61,22 @@ def distance(context: Context) -> Iterator[Row]:
             )  # fmt: skip
 
 
-def against_rays(gdm: Gdm, rays: RayCastGdm, n: int) -> Error:
+def refined(context: Context) -> Iterator[Row]:
+    """Weave: rays asked again on the safe way, without a shell."""
+    gdm = table("weave", GdmOptions(texels=64, layers=32), context, backing=True)
+    rays = RayCastGdm(generators.weave(backing=True), gdm.cap)
+    for queries in (1, 32) if context.quick else (1, 2, 4, 8, 16, 32):
+        found = against_rays(gdm, rays, 30_000, queries=queries)
+        for share, word, goal in ((0.5, "median", 0.5), (0.95, "p95", {1: 2.0, 32: 0.5}.get(queries))):
+            yield Row(
+                id=f"refined.{word}.{queries}", unit="voxels", better="lower", n=len(found.off), goal=goal,
+                what=f"weave 64x64x32x16x32, at most {queries} look-ups of any way: {word} error of hits",
+                value=round(float(found.off.quantile(share)), 3),
+                curve={"series": "look-ups", "x": queries, "y": word},
+            )  # fmt: skip
+
+
+def against_rays(gdm: Gdm, rays: RayCastGdm, n: int, *, queries: int = 1) -> Error:
     """Return the errors of a table at `n` points, a third of them at the top of the slab."""
     rng = torch.Generator().manual_seed(5)
     place = torch.rand(n, 3, generator=rng)
@@ -71,7 +87,7 @@ def against_rays(gdm: Gdm, rays: RayCastGdm, n: int) -> Error:
     w[:, 2] = torch.where(place[:, 2] == 0, -w[:, 2].abs(), w[:, 2])
     t, _ = rays.cast(place, w, torch.zeros(len(place), dtype=torch.bool))
     left = t > gdm.boundary(place, w) + 1e-4
-    found = gdm.evaluate(place.double(), w.double())
+    found = gdm_query.approach(gdm, place.double(), w.double(), queries=queries)
     both = ~left & ~found.left
     return Error(found.left == left, (found.distance - t.double()).abs()[both] / gdm.voxel)
 
