@@ -184,7 +184,7 @@ def _factor(gram: Float[Tensor, "n n"]) -> Float[Tensor, "n j"]:
     return vectors[:, kept] * values[kept].clamp(min=0).sqrt()
 
 
-def exemplar(look: Look, metric: Metric | None = None, *, channels_kept: int = 24, energy: float = 0.9999) -> Exemplar:
+def exemplar(look: Look, metric: Metric | None = None, *, channels_kept: int = 24, energy: float = 0.99) -> Exemplar:
     """Return `look` as whole numbers on the principal axes of its channels.
 
     Args:
@@ -199,7 +199,7 @@ def exemplar(look: Look, metric: Metric | None = None, *, channels_kept: int = 2
     """
     check_range("channels_kept", channels_kept, 1, 256)
     check_range("energy", energy, 0, 1)
-    with _one_thread():
+    with one_thread():
         found = channels(look, metric)
         check_finite("exemplar", found)
         return _quantised(found, channels_kept, energy)
@@ -225,8 +225,8 @@ def _quantised(found: Float[Tensor, "H W C"], most: int, energy: float) -> Exemp
 
 
 @contextmanager
-def _one_thread() -> Iterator[None]:
-    """Compute on one thread: sums of floats then run in one order, whatever the machine."""
+def one_thread() -> Iterator[None]:
+    """Compute on one thread: sums of floats run in one order, and small ones are not cut into smaller ones."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

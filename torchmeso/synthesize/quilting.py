@@ -29,7 +29,7 @@ from torchmeso.backends import BackendChoice, opencl
 from torchmeso.data.quilting_map import QuiltingMap
 from torchmeso.errors import ConfigError, check_range
 from torchmeso.synthesize import seam_dp
-from torchmeso.synthesize.patch_error import Exemplar, Search
+from torchmeso.synthesize.patch_error import Exemplar, Search, one_thread
 
 Rule = Literal["rms", "best"]
 
@@ -113,10 +113,11 @@ def grow(
     rows, columns = (_grid(n, side, overlap, tileable=options.tileable) for n in size)
     state = _State(source, options, side, rows, columns, rng, opencl.resolve(backend))
     total = len(rows.starts) * len(columns.starts)
-    for i in range(len(rows.starts)):
-        for j in range(len(columns.starts)):
-            state.lay(i, j)
-            progress(len(state.places) / total)
+    with one_thread():  # a patch is too little work for two
+        for i in range(len(rows.starts)):
+            for j in range(len(columns.starts)):
+                state.lay(i, j)
+                progress(len(state.places) / total)
     index, patch = (x[: size[0], : size[1]].int().contiguous() for x in (state.index, state.patch))
     quilted = QuiltingMap(index=index, source=source.texels, tileable=options.tileable)
     return Quilt(quilted, patch, state.within / (total - 1) if total > 1 else 1.0)
