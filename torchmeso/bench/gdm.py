@@ -3,7 +3,7 @@
 Test: tests/bench/test_gdm.py
 """
 
-from torchmeso.bench import gdm_error, gdm_speed
+from torchmeso.bench import gdm_error, gdm_identity, gdm_speed
 from torchmeso.bench.suite import Measurement
 
 MEASUREMENTS = [
@@ -16,4 +16,6 @@ MEASUREMENTS = [
     Measurement("distance", gdm_error.distance),
     Measurement("silhouette", gdm_error.silhouette),
     Measurement("distortion", gdm_error.distortion),
+    Measurement("identity", gdm_identity.identity),
+    Measurement("outline", gdm_identity.outlines),
 ]
