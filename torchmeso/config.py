@@ -178,11 +178,20 @@ class PlaceConfig(_Strict):
         return result
 
 
+class RegionConfig(_Strict):
+    """Faces whose middle lies in a box, in the mesh's own coordinates before it is placed, and their material."""
+
+    low: Vector
+    high: Vector
+    material: str
+
+
 class ObjectConfig(PlaceConfig):
     """A built-in shape or a mesh file, its materials, and where it stands.
 
     `material` is that of all parts, `materials` gives others to parts of a file (`usemtl`, materials of a glTF file);
-    parts without either look as their file says. `uv_set` chooses among a glTF file's texture coordinates; `unwrap`
+    parts without either look as their file says. `regions` give materials to faces by where they lie, later ones over
+    earlier ones. `uv_set` chooses among a glTF file's texture coordinates; `unwrap`
     (true, or options of the atlas) makes new ones at one `tile_size`. `instances` are further places, each applied
     after the object's own; the mesh is read once.
     """
@@ -197,6 +206,7 @@ class ObjectConfig(PlaceConfig):
     unwrap: bool | UnwrapOptions = False
     tile_size: float | None = None
     instances: list[PlaceConfig] = Field(default_factory=list)
+    regions: list[RegionConfig] = Field(default_factory=list)
 
     @model_validator(mode="after")
     def _check(self) -> "ObjectConfig":
@@ -237,7 +247,8 @@ class ObjectConfig(PlaceConfig):
     @property
     def used_materials(self) -> set[str]:
         """Names of the materials it asks for."""
-        return set(self.materials.values()) | ({self.material} if self.material is not None else set())
+        named = [*self.materials.values(), *(region.material for region in self.regions)]
+        return set(named) | ({self.material} if self.material is not None else set())
 
     def places(self) -> list[torch.Tensor]:
         """Return the 4 x 4 matrix of every place it stands at."""
@@ -504,6 +515,7 @@ def _fields(kind: Any) -> dict[str, Any]:
         "materials": MaterialConfig,
         "objects": ObjectConfig,
         "instances": PlaceConfig,
+        "regions": RegionConfig,
         "unwrap": UnwrapOptions,
         "camera": CameraConfig,
         "render": FrameOptions,

@@ -46,3 +46,13 @@ def test_barycentric_inverts_interpolation(rng):
     weights = weights / weights.sum(-1, keepdim=True)
     uv = (weights[..., None] * triangle).sum(1)
     torch.testing.assert_close(prisms.barycentric(uv, triangle), weights, rtol=1e-8, atol=1e-8)
+
+
+def test_thin_triangles_are_told_whatever_their_size():
+    """A right triangle of height 1e-3 and one of 1e-8, scaled and moved; far from 0 even the first is too thin."""
+    for scale in (1e-3, 1.0, 1e3):
+        good, bad = (torch.tensor([[0.0, 0], [1, 0], [0, height]]).double() * scale for height in (1e-3, 1e-8))
+        assert prisms.is_thin(torch.stack([good, bad])).tolist() == [False, True]
+    good = torch.tensor([[0.0, 0], [1, 0], [0, 1e-3]]).double()
+    assert prisms.is_thin(torch.stack([good + 100, good + 1e4])).tolist() == [False, True]
+    assert prisms.is_thin(torch.zeros(3, 2))

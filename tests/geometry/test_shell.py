@@ -92,6 +92,20 @@ def test_faces_of_no_area_are_left_out():
     assert (volumes(built) > 0).all()
 
 
+def test_a_repeated_face_carries_one_prism():
+    """Whatever corner it begins with; turned over it is another face."""
+    from dataclasses import replace
+
+    body = BODIES["torus"]()
+    single = shell.build(body, 0.05)
+    both = torch.cat([body.component, body.component])
+    twice = shell.build(replace(body, faces=torch.cat([body.faces, body.faces.roll(1, 1)]), component=both), 0.05)
+    assert torch.equal(single.face, twice.face)
+    assert torch.equal(single.neighbour, twice.neighbour)
+    turned = shell.build(replace(body, faces=torch.cat([body.faces, body.faces.flip(1)]), component=both), 0.05)
+    assert len(turned.face) == 2 * len(single.face)
+
+
 @pytest.mark.errors
 def test_absurd_shells_are_refused():
     body = BODIES["plane"]()

@@ -1,9 +1,12 @@
 """Laws of every built-in tile; closed forms stand in the tests of the files they are made in."""
 
+import inspect
+
 import pytest
 import torch
 
 from tests.meso.looks import looks, wrong
+from torchmeso.errors import MesoError
 from torchmeso.geometry.rays import RayScene
 from torchmeso.meso.bake_mdf import RayCastMdf
 from torchmeso.meso.generators import GENERATORS
@@ -52,3 +55,18 @@ def test_only_open_tiles_let_rays_through(name, rng):
     D = RayCastMdf(GENERATORS[name]()).evaluate(*looks(rng, 60))
     assert bool(D.isinf().any()) == (name in OPEN)
     assert float(D.isinf().double().mean()) < 0.75
+
+
+ODD = {int: (-1, 0, 1, 3, 10**6, 2**40), float: (-1.0, 0.0, 1e-30, 1e30)}
+
+
+@pytest.mark.errors
+@pytest.mark.parametrize("name", list(GENERATORS))
+def test_numbers_out_of_range_are_refused_or_make_a_tile(name):
+    """Nothing else leaves, and nothing takes all memory to find out."""
+    for key, parameter in inspect.signature(GENERATORS[name]).parameters.items():
+        for value in ODD.get(type(parameter.default), ()):
+            try:
+                GENERATORS[name](**{key: value})
+            except MesoError:
+                continue

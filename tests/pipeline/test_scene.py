@@ -1,8 +1,11 @@
+from pathlib import Path
+
 import pytest
 import torch
 from PIL import Image
 
 from tests.pipeline.small import small
+from torchmeso import config
 from torchmeso.config import ObjectConfig
 from torchmeso.data.textured import Textured
 from torchmeso.errors import ConfigError, GeometryError
@@ -117,3 +120,34 @@ def test_parts_nobody_named(tmp_path):
         ConfigError, match="expected a material for the part 'front', got none; name one in 'materials'"
     ):
         scene.build(settings, bake.prepare(settings))
+
+
+def regional(**regions):
+    content = {
+        "materials": {"a": {"albedo": [1, 0, 0]}, "b": {"albedo": [0, 1, 0]}, "c": {"albedo": [0, 0, 1]}},
+        "objects": [{"shape": "sphere", "options": {"triangles": 300}, "material": "a", **regions}],
+        "camera": {"eye": [0, 0, 5]},
+    }
+    return config.parse(content, folder=Path())
+
+
+def test_regions_dress_faces_by_where_they_lie():
+    """The later one wins, and a placed body keeps the parts of the unplaced one."""
+    upper = {"low": [-2, 0, -2], "high": [2, 2, 2], "material": "b"}
+    right = {"low": [0.5, -2, -2], "high": [2, 2, 2], "material": "c"}
+    settings = regional(regions=[upper, right], translate=[0, 100, 0])
+    body = scene.read_body(settings.objects[0])
+    middle = body.mesh.vertices[body.mesh.faces].mean(1)
+    expected = torch.where(middle[:, 0] >= 0.5, 2, torch.where(middle[:, 1] >= 0, 1, 0))
+    assert body.looks == ("a", "b", "c")
+    assert torch.equal(body.part, expected)
+    assert settings.objects[0].used_materials == {"a", "b", "c"}
+
+
+@pytest.mark.errors
+def test_a_region_without_faces_is_refused():
+    far = {"low": [5, 5, 5], "high": [6, 6, 6], "material": "b"}
+    with pytest.raises(ConfigError, match=r"expected faces between .* got none; the mesh lies between"):
+        scene.read_body(regional(regions=[far]).objects[0])
+    with pytest.raises(ConfigError, match="no material is called 'd'"):
+        regional(regions=[{**far, "material": "d"}])

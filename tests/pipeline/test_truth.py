@@ -1,7 +1,10 @@
+from pathlib import Path
+
 import pytest
 import torch
 
 from tests.pipeline.small import small
+from torchmeso import config
 from torchmeso.errors import ConfigError
 from torchmeso.geometry import glb, shapes
 from torchmeso.geometry.glb import Body
@@ -111,3 +114,20 @@ def test_a_shell_has_a_floor_and_stands_on_its_side(side):
     origin, direction, _ = settings.camera.build().rays(settings.camera.build().pixel_centres())
     height = (origin + found.depth[..., None] * direction)[..., 1][red]
     torch.testing.assert_close(height, torch.full_like(height, 6.0 - floor), rtol=0, atol=1e-3)
+
+
+def test_another_shell_has_another_truth():
+    """Its side, its base and its floor are seen; how a GDM is baked is not."""
+    content = {
+        "materials": {"a": {"meso": {"type": "weave"}, "gdm": {"texels": 8, "layers": 4}}},
+        "objects": [{"shape": "sphere", "material": "a"}],
+        "camera": {"eye": [0, 0, 5]},
+    }
+
+    def key(**changes):
+        material = {**content["materials"]["a"], **changes}
+        return truth._key(config.parse({**content, "materials": {"a": material}}, folder=Path()))
+
+    shells = [{"shell": {"side": "outward"}}, {"shell": {"base": "open"}}, {"floor": [0, 0, 0]}, {}]
+    assert len({key(**changes) for changes in shells}) == 4
+    assert key() == key(gdm={"texels": 16, "layers": 8})

@@ -72,14 +72,14 @@ def cases(size: int = 192) -> Iterator[Case]:
 def grazing(deg: float, size: int) -> tuple[Scene, Camera]:
     """Return the still life seen at `deg` degrees from the floor's normal."""
     rise = math.radians(90 - deg)
-    return _scene(), _camera((0.0, -0.6 + 5 * math.sin(rise), 5 * math.cos(rise)), (0.0, -0.6, 0.0), size)
+    return scene_of(), camera_at((0.0, -0.6 + 5 * math.sin(rise), 5 * math.cos(rise)), (0.0, -0.6, 0.0), size)
 
 
 def moved_to(distance: float, size: int) -> tuple[Scene, Camera]:
     """Return the still life, with its camera, far out along x and z."""
-    scene = _scene(tuple(_placed(o, shift=(distance, 0.0, distance)) for o in _still_life()))
+    scene = scene_of(tuple(placed(o, shift=(distance, 0.0, distance)) for o in _still_life()))
     eye, at = (EYE[0] + distance, EYE[1], EYE[2] + distance), (distance, 0.0, distance)
-    return scene, _camera(eye, at, size)
+    return scene, camera_at(eye, at, size)
 
 
 def table(spectrum: Tensor, seed: int = 0) -> Btf:
@@ -98,46 +98,46 @@ def _views(size: int) -> Iterator[Case]:
     for deg in (89.0, 89.9, 89.99):
         yield Case(name=f"view_{deg:g}deg", what=f"the floor seen at {deg:g} degrees", make=partial(grazing, deg, size))
     for deg in (0.1, 0.0, -0.1):
-        light = _sun((math.cos(math.radians(deg)), math.sin(math.radians(deg)), 0.0))
+        light = sun((math.cos(math.radians(deg)), math.sin(math.radians(deg)), 0.0))
         yield Case(
             name=f"light_{deg:g}deg", what=f"a light {deg:g} degrees above the horizon",
-            make=lambda light=light: (_scene(lights=(light,)), _camera(EYE, size=size)),
+            make=lambda light=light: (scene_of(lights=(light,)), camera_at(EYE, size=size)),
         )  # fmt: skip
     eyes = {
         "inside_object": (0.0, 0.0, 1.0),
         "inside_slab": (0.0, 0.39, 1.0),
         "on_surface": (0.0, 0.4, 1.0),
-        "on_vertex": tuple(_torus().vertices[17].tolist()),
+        "on_vertex": tuple(small_torus().vertices[17].tolist()),
         "under_floor": (0.3, -0.62, 0.2),
     }
     for name, eye in eyes.items():
         yield Case(
             name=f"eye_{name}", what=f"an eye {name.replace('_', ' ')}",
-            make=lambda eye=eye: (_scene(), _camera(eye, (0.1, 0.1, 0.0), size)), bound=0.5,
+            make=lambda eye=eye: (scene_of(), camera_at(eye, (0.1, 0.1, 0.0), size)), bound=0.5,
         )  # fmt: skip
     for width, height in ((1, 1), (1, 64), (64, 1)):
         yield Case(
             name=f"picture_{width}x{height}", what=f"a picture of {width} x {height} pixels",
-            make=lambda w=width, h=height: (_scene(), replace(_camera(EYE, size=size), width=w, height=h)),
+            make=lambda w=width, h=height: (scene_of(), replace(camera_at(EYE, size=size), width=w, height=h)),
         )  # fmt: skip
     place = torch.tensor([0.0, 0.4, 1.0])
-    for name, position in {"on_surface": place, "on_vertex": _torus().vertices[17], "inside": place * 0.9}.items():
+    for name, position in {"on_surface": place, "on_vertex": small_torus().vertices[17], "inside": place * 0.9}.items():
         lamp = PointLight(position=position, intensity=torch.ones(3))
         yield Case(
             name=f"lamp_{name}", what=f"a point light {name.replace('_', ' ')}",
-            make=lambda lamp=lamp: (_scene(lights=(lamp,)), _camera(EYE, size=size)), bound=0.5,
+            make=lambda lamp=lamp: (scene_of(lights=(lamp,)), camera_at(EYE, size=size)), bound=0.5,
         )  # fmt: skip
 
 
 def _places(size: int) -> Iterator[Case]:
     def home() -> tuple[Scene, Camera]:
-        return _scene(), _camera(EYE, size=size)
+        return scene_of(), camera_at(EYE, size=size)
 
     for scale in (1e-3, 1e3):
         yield Case(
             name=f"scale_{scale:g}", what=f"everything {scale:g} times as large, against the scene as it is",
             make=lambda s=scale: (
-                _scene(tuple(_placed(o, scale=s) for o in _still_life())), _camera([s * x for x in EYE], size=size),
+                scene_of(tuple(placed(o, scale=s) for o in _still_life())), camera_at([s * x for x in EYE], size=size),
             ),
             truth=home,
         )  # fmt: skip
@@ -148,8 +148,9 @@ def _places(size: int) -> Iterator[Case]:
         )  # fmt: skip
 
 
-def _meshes(size: int) -> Iterator[Case]:
-    torus, rng = _torus(), torch.Generator().manual_seed(0)
+def raw_meshes() -> dict[str, tuple[str, Tensor, Tensor, Tensor]]:
+    """Return meshes that something is wrong with: what, and their vertices, faces and texture coordinates."""
+    torus, rng = small_torus(), torch.Generator().manual_seed(0)
     v, f, uv = torus.vertices, torus.faces, torus.uv
     needles = torch.tensor(
         [[0, 0.5, 0], [1, 0.5, 1e-7], [2, 0.5, 0], [0, 0.6, 0], [1e-8, 0.6, 0], [0, 0.6, 2], [0, 0.7, 0], [1, 0.7, 1]]
@@ -160,7 +161,7 @@ def _meshes(size: int) -> Iterator[Case]:
     kept = torch.rand(len(f), generator=rng) > 0.1
     more = torch.tensor([[0, 1, 2], [3, 4, 5], [6, 7, 6]])
     soup = torch.rand(600, 3, generator=rng) * 2 - 1, torch.randint(0, 600, (1500, 3), generator=rng)
-    raw: dict[str, tuple[str, Tensor, Tensor, Tensor]] = {
+    return {
         "zero_area": ("triangles without area", v, torch.cat([f, f[::3, [0, 0, 1]], f[::5, [0, 0, 0]]]), uv),
         "needles": (
             "triangles 1e-7 thin", torch.cat([v, needles]), torch.cat([f, len(v) + more]),
@@ -180,15 +181,19 @@ def _meshes(size: int) -> Iterator[Case]:
         "uv_almost_a_line": ("a texture stretched 1e12 times", v, f, uv * torch.tensor([1.0, 1e-12])),
         "soup": ("random triangles", *soup, torch.rand(600, 2, generator=rng) * 4),
     }  # fmt: skip
-    for name, (what, *arrays) in raw.items():
+
+
+def _meshes(size: int) -> Iterator[Case]:
+    torus = small_torus()
+    for name, (what, *arrays) in raw_meshes().items():
         yield Case(
             name=f"mesh_{name}", what=what,
-            make=lambda a=arrays: (_scene(_with_floor(_dressed(*a))), _camera(EYE, size=size)),
+            make=lambda a=arrays: (scene_of(_with_floor(dressed(*a))), camera_at(EYE, size=size)),
         )  # fmt: skip
     for name, tangents in {"zero": torus.tangents * 0, "along_normals": torus.normals}.items():
         yield Case(
             name=f"tangents_{name}", what=f"tangents {name.replace('_', ' ')}",
-            make=lambda t=tangents: (_scene(_with_floor(replace(torus, tangents=t))), _camera(EYE, size=size)),
+            make=lambda t=tangents: (scene_of(_with_floor(replace(torus, tangents=t))), camera_at(EYE, size=size)),
         )  # fmt: skip
 
 
@@ -211,7 +216,7 @@ def _tables(size: int) -> Iterator[Case]:
         yield Case(
             name=f"btf_{name}", what=what, exposure=1e-12 if name == "large" else 1.0,
             make=lambda i=images, r=rank, d=directions: (
-                _scene(_with_floor(_torus(), replace(_brick(), btf=_fitted(i, r, d)))), _camera(EYE, size=size),
+                scene_of(_with_floor(small_torus(), replace(brick(), btf=_fitted(i, r, d)))), camera_at(EYE, size=size),
             ),
         )  # fmt: skip
     one, many = hemisphere.parse("grid(1, 1, 45)"), hemisphere.parse("grid(8, 4, 87.5)")
@@ -231,7 +236,7 @@ def _tables(size: int) -> Iterator[Case]:
         yield Case(
             name=f"mdf_{name}", what=what,
             make=lambda m=mdf: (
-                _scene(_with_floor(_torus(), replace(_brick(), mdf=m))), _camera(EYE, size=size),
+                scene_of(_with_floor(small_torus(), replace(brick(), mdf=m))), camera_at(EYE, size=size),
             ),
         )  # fmt: skip
 
@@ -254,7 +259,7 @@ def refusals() -> Iterator[Refusal]:
             name=f"mdf_{name}", what=f"an MDF of drops {drop}",
             make=partial(Mdf, delta=delta, no_hit=None, directions=views, h=0.1),
         )  # fmt: skip
-    torus = _torus()
+    torus = small_torus()
     v, f, uv = torus.vertices, torus.faces, torus.uv
     meshes = {
         "nan": (v * math.nan, f, uv),
@@ -276,32 +281,37 @@ def refusals() -> Iterator[Refusal]:
         yield Refusal(name=f"light_{name}", what=f"a light of {name.replace('_', ' ')}", make=make)
     for name, options in {"eye": {"eye": (math.nan, 0, 0)}, "near": {"near": math.nan}, "size": {"size": 0}}.items():
         yield Refusal(
-            name=f"camera_{name}", what=f"a camera without {name}", make=partial(_camera, **{"eye": EYE, **options})
+            name=f"camera_{name}", what=f"a camera without {name}", make=partial(camera_at, **{"eye": EYE, **options})
         )
 
 
-def _camera(eye, at=(0.0, 0.0, 0.0), size: int = 64, **options) -> Camera:
+def camera_at(eye, at=(0.0, 0.0, 0.0), size: int = 64, **options) -> Camera:
+    """Return a square picture from `eye` to `at`, y up."""
     place, axes = look_at(*(torch.tensor(x, dtype=torch.float64) for x in (eye, at, (0.0, 1.0, 0.0))))
     return Camera(eye=place, axes=axes, **{"width": size, "height": size, **options})
 
 
-def _sun(direction: tuple[float, float, float]) -> DirectionalLight:
+def sun(direction: tuple[float, float, float]) -> DirectionalLight:
+    """Return a light that gives a white diffuser facing it radiance 1."""
     towards = torch.nn.functional.normalize(torch.tensor(direction), dim=0)
     return DirectionalLight(direction=towards, irradiance=torch.full((3,), torch.pi))
 
 
-def _scene(objects: tuple[Object, ...] | None = None, lights: tuple[Light, ...] | None = None) -> Scene:
-    lights = (_sun((1.0, 2.0, 1.0)),) if lights is None else lights
+def scene_of(objects: tuple[Object, ...] | None = None, lights: tuple[Light, ...] | None = None) -> Scene:
+    """Return objects in the sun, the still life unless told otherwise, before a background of its own."""
+    lights = (sun((1.0, 2.0, 1.0)),) if lights is None else lights
     return Scene(objects=objects or _still_life(), lights=lights, background=(0.1, 0.2, 0.3))
 
 
 @cache
-def _torus() -> Mesh:
+def small_torus() -> Mesh:
+    """Return the body that most cases wear out."""
     return shapes.torus(tiles=(6, 2), triangles=600)
 
 
 @cache
-def _brick() -> Material:
+def brick() -> Material:
+    """Return bricks with relief."""
     options = BtfOptions(texels=16, lights=VIEWS, views=VIEWS, samples=1, bounces=0)
     model = eigen.fit(bake_btf.in_memory(generators.brick(), options), EigenOptions(rank=6))
     depth = bake_mdf.in_memory(generators.brick(), MdfOptions(texels=32, views="grid(8, 4, 87.5)"))
@@ -316,28 +326,30 @@ def _weave() -> Material:
 
 @cache
 def _floor() -> Object:
-    plane = Object(mesh=shapes.plane(size=(6.0, 6.0), tiles=(4, 4)), material=_brick())
-    return _placed(plane, shift=(0.0, -0.6, 0.0))
+    plane = Object(mesh=shapes.plane(size=(6.0, 6.0), tiles=(4, 4)), material=brick())
+    return placed(plane, shift=(0.0, -0.6, 0.0))
 
 
 @cache
 def _still_life() -> tuple[Object, ...]:
     """A torus of bricks, a woven cylinder with holes, and a floor of bricks."""
     can = Object(mesh=shapes.cylinder(radius=0.3, height=0.8, tiles=(4, 2), triangles=400), material=_weave())
-    return Object(mesh=_torus(), material=_brick()), _placed(can, shift=(1.3, 0.0, 0.0)), _floor()
+    return Object(mesh=small_torus(), material=brick()), placed(can, shift=(1.3, 0.0, 0.0)), _floor()
 
 
 def _with_floor(subject: Mesh, material: Material | None = None) -> tuple[Object, ...]:
-    return Object(mesh=subject, material=material or _brick()), _floor()
+    return Object(mesh=subject, material=material or brick()), _floor()
 
 
-def _placed(item: Object, scale: float = 1.0, shift: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Object:
+def placed(item: Object, scale: float = 1.0, shift: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Object:
+    """Return an object elsewhere."""
     matrix = torch.eye(4, dtype=torch.float64) * scale
     matrix[:, 3] = torch.tensor([*shift, 1.0], dtype=torch.float64)
     return replace(item, mesh=mesh.transform(item.mesh, matrix))
 
 
-def _dressed(vertices: Tensor, faces: Tensor, uv: Tensor) -> Mesh:
+def dressed(vertices: Tensor, faces: Tensor, uv: Tensor) -> Mesh:
+    """Return a mesh of arrays that something is wrong with."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what is wrong with these meshes is known
         return dress(vertices, faces, uv)

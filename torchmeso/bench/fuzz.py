@@ -21,13 +21,18 @@ from torchmeso import config
 from torchmeso.bench.suite import Context, Measurement, Row
 from torchmeso.compress import eigen
 from torchmeso.compress.eigen import EigenOptions
-from torchmeso.data import btf, eigen_btf, image, mdf
+from torchmeso.data import btf, eigen_btf, gdm, image, mdf
 from torchmeso.data.btf import Btf
 from torchmeso.data.mdf import Mdf
 from torchmeso.errors import MesoError
 from torchmeso.geometry import hemisphere, mesh, mesh_file, shapes
+from torchmeso.meso import bake_gdm, generators
+from torchmeso.meso.bake_gdm import GdmOptions
 from torchmeso.pipeline import demo
 from torchmeso.pipeline.bake import open_model
+from torchmeso.render import frame
+from torchmeso.render.frame import FrameOptions
+from torchmeso.render.scene import Material, Object, Scene
 
 ODDITIES: tuple[Any, ...] = (
     None, True, False, 0, 1, -1, 2**31, 2**63, 10**400, 0.0, -0.0, 1e-300, 1e300, float("inf"), float("nan"), "", " ",
@@ -128,6 +133,71 @@ def configurations(folder: Path) -> Callable[[Random], None]:
     return case
 
 
+SHELLED = """
+name: shell
+materials:
+  a: {meso: {type: weave, h: 0.16, segments: 4}, gdm: {texels: 4, layers: 2, n_theta: 2, n_phi: 3, cap: 1.0},
+      shell: {side: outward, base: open, queries: 2}, floor: [0.1, 0.2, 0.3]}
+objects:
+  - {shape: torus, options: {triangles: 100, tube: 0.4}, tiles: [3, 1], scale: 1.0, material: a}
+lights: [{type: directional, direction: [0.5, 0.8, 0.4]}]
+camera: {eye: [0, 2, 2], width: 4, height: 4}
+"""
+"""A configuration small enough to be baked and drawn, whatever its numbers become."""
+
+MOST_SAMPLES = 1 << 14
+"""Of a table that is baked for a case."""
+
+
+def shells(folder: Path) -> Callable[[Random], None]:
+    """Configurations with a GDM in a shell: read, baked and drawn."""
+    tree = yaml.safe_load(SHELLED)
+
+    def case(random: Random) -> None:
+        section = random.choice([tree["materials"]["a"], tree["materials"]["a"], tree["objects"][0], tree])
+        part = damaged_tree(section, random)
+        content = copy.deepcopy(tree)
+        if section is tree:
+            content = part
+        elif section is tree["objects"][0]:
+            content["objects"][0] = part
+        else:
+            content["materials"]["a"] = part
+        _draw(config.parse(content, folder=folder))
+
+    return case
+
+
+def _draw(found: config.Config) -> None:
+    """Bake and draw a configuration of a shape in a shell, unless it has become too large for that."""
+    material, item = found.materials["a"], found.objects[0]
+    if material.gdm is None or material.meso is None or item.shape is None:
+        return
+    meso = material.meso.build()
+    body, camera = item.build_shape(), found.camera.build()
+    if len(body.faces) > 200 or camera.width * camera.height > 256:
+        return
+    yarns = material.meso.arguments
+    if yarns.get("count", 4) * yarns.get("segments", 24) > 24:
+        return
+    options = material.gdm
+    if options.layers * options.texels**2 * options.n_theta * options.n_phi * options.supersample**3 > MOST_SAMPLES:
+        return
+    table = bake_gdm.in_memory(meso, options)
+    scene = Scene(
+        objects=(
+            Object(
+                mesh=mesh.transform(body, item.matrix()),
+                material=Material(gdm=table, shell=material.shell, albedo=material.floor),
+            ),
+        ),
+        lights=tuple(light.build() for light in found.lights),
+    )  # fmt: skip
+    picture = frame.render(scene, camera, FrameOptions(shadow_map_size=16))
+    if not bool(picture.rgb.isfinite().all()):
+        raise ArithmeticError("values of the picture are not finite")
+
+
 def meshes(folder: Path) -> Callable[[Random], None]:
     """Mesh files, and random triangles."""
     import trimesh
@@ -200,6 +270,8 @@ def tables(folder: Path) -> Callable[[Random], None]:
     btf.save(Btf(images=images, lights=directions, views=directions, h=0.1), whole / "a.btf.zarr")
     delta = torch.zeros(6, 4, 4, dtype=torch.uint8)
     mdf.save(Mdf(delta=delta, no_hit=None, directions=directions, h=0.1), whole / "a.mdf.zarr")
+    tile = bake_gdm.in_memory(generators.sheet(), GdmOptions(texels=2, layers=2, n_theta=2, n_phi=3))
+    gdm.save(tile, whole / "a.gdm.zarr")
     image.write_png(whole / "a.png", images[0, 0])
     image.write_exr(whole / "a.exr", images[0, 0])
     files = sorted(p.relative_to(whole) for p in whole.rglob("*") if p.is_file())
@@ -228,12 +300,15 @@ def _read_table(folder: Path, name: str) -> None:
         table.rows(0, table.texels[0])
     elif name.endswith(".mdf.zarr"):
         mdf.load(folder / name)
+    elif name.endswith(".gdm.zarr"):
+        gdm.load(folder / name)
     else:
         image.read(folder / name)
 
 
 KINDS = (
-    Kind("config", 0.5, configurations),
+    Kind("config", 0.49, configurations),
+    Kind("shell", 0.01, shells),
     Kind("mesh", 0.25, meshes),
     Kind("model", 0.2, models),
     Kind("table", 0.05, tables),

@@ -3,7 +3,7 @@
 Test: tests/bench/test_gdm.py
 """
 
-from torchmeso.bench import gdm_bake, gdm_error, gdm_speed, gdm_tables
+from torchmeso.bench import gdm_bake, gdm_error, gdm_identity, gdm_speed, gdm_tables
 from torchmeso.bench.suite import Measurement
 
 MEASUREMENTS = [
@@ -19,4 +19,6 @@ MEASUREMENTS = [
     Measurement("silhouette", gdm_error.silhouette),
     Measurement("tables", gdm_tables.tables),
     Measurement("distortion", gdm_error.distortion),
+    Measurement("identity", gdm_identity.identity),
+    Measurement("outline", gdm_identity.outlines),
 ]

@@ -17,6 +17,7 @@ from torchmeso.data import gdm_query
 from torchmeso.data.gdm import Gdm
 from torchmeso.geometry import shapes
 from torchmeso.geometry.directions import normalize
+from torchmeso.geometry.mesh import Mesh, dress
 from torchmeso.geometry.rays import RayScene
 from torchmeso.meso import generators
 from torchmeso.meso.bake_gdm import GdmOptions, RayCastGdm
@@ -153,6 +154,9 @@ def near_outline(mask: Bool[Tensor, "H W"]) -> Bool[Tensor, "H W"]:
 def distortion(context: Context) -> Iterator[Row]:
     """Base meshes ever finer: how far rays end from where they do on the finest, laid over it as triangles."""
     bodies = {
+        "flat": lambda n: shapes.plane(triangles=n),
+        "cylinder": lambda n: shapes.cylinder(radius=0.7, height=1.6, tiles=(6, 2), triangles=n),
+        "saddle": saddle,
         "sphere": lambda n: shapes.sphere(triangles=n, tiles=(6, 3)),
         "torus": lambda n: shapes.torus(triangles=n, tiles=(5, 2)),
     }
@@ -171,3 +175,11 @@ def distortion(context: Context) -> Iterator[Row]:
                 what=f"{name} of {len(mesh.faces)} triangles: median error of where rays end, beside the finest",
                 value=round(float(off.median()), 5), curve={"series": name, "x": factor, "y": "median"},
             )  # fmt: skip
+
+
+def saddle(triangles: int) -> Mesh:
+    """Return a sheet that bends up along x and down along z, by radii of 1."""
+    sheet = shapes.plane(triangles=triangles)
+    vertices = sheet.vertices.clone()
+    vertices[:, 1] = 0.5 * (vertices[:, 0].square() - vertices[:, 2].square())
+    return dress(vertices, sheet.faces, sheet.uv)

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from torchmeso.bench import peers
 from torchmeso.bench.peers import PeerMissing
+from torchmeso.bench.slices import Slices
 from torchmeso.bench.speed import MAP, ratio
 from torchmeso.bench.suite import Context, Row
 from torchmeso.bench.timing import time_together
@@ -276,27 +277,40 @@ def random_entries(built: shell.Shell, n: int, kind: str, rng: torch.Generator) 
 
 
 def slices(context: Context) -> Iterator[Row]:
-    """Frame time over the layers of the volume."""
+    """Frame time over the layers of the volume, ours and of the same volume drawn as textured slices."""
     mesh, camera = shapes.torus(triangles=12000, tiles=(5, 2)), view()
+    gdms = {n: table("weave", GdmOptions(texels=64, layers=n), context, backing=True) for n in (16, 64)}
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        renderers = {
-            n: drawn(
-                scene_of(mesh, Material(gdm=table("weave", GdmOptions(texels=64, layers=n), context, backing=True))),
-                shadows=True,
-            )
-            for n in (16, 64)
-        }
-        timing = time_together({str(n): partial(r.show, camera) for n, r in renderers.items()}, n=15, warm=3, settle=2)
+        calls = {}
+        for n, gdm in gdms.items():
+            scene = scene_of(mesh, Material(gdm=gdm))
+            calls[f"shadows {n}"] = partial(drawn(scene, shadows=True).show, camera)
+            calls[f"plain {n}"] = partial(drawn(scene, shadows=False).show, camera)
+            calls[f"slices {n}"] = partial(Slices(mesh, gdm, camera, LIGHT).draw, camera)
+        timing = time_together(calls, n=5 if context.quick else 15, warm=3, settle=2)
     finally:
         torch.set_num_threads(threads)
-    more = timing["64"].wall / timing["16"].wall - 1
-    yield Row(
-        id="slices.direct", what="64 layers beside 16, 64 x 64 voxels, direct table, with shadows: more time",
-        value=round(100 * more, 1), unit="%", better="lower", goal=40, n=15,
-        peer=f"{timing['16'].wall:.1f} ms and {timing['64'].wall:.1f} ms",
-    )  # fmt: skip
+    kinds = {
+        "direct": ("shadows", "direct table, with shadows", 40),
+        "plain": ("plain", "direct table, without shadows", None),
+        "baseline": ("slices", "drawn as textured slices, without shadows", None),
+    }
+    for name, (key, what, goal) in kinds.items():
+        few, many = timing[f"{key} 16"], timing[f"{key} 64"]
+        yield Row(
+            id=f"slices.{name}", what=f"64 layers beside 16, 64 x 64 voxels, {what}: more time",
+            value=round(100 * (many.wall / few.wall - 1), 1), unit="%", better="lower", goal=goal, n=few.n,
+            peer=f"{few.wall:.1f} ms and {many.wall:.1f} ms",
+        )  # fmt: skip
+    for n in gdms:
+        ours, theirs = timing[f"plain {n}"], timing[f"slices {n}"]
+        yield Row(
+            id=f"slices.vs_baseline.{n}", what=f"{n} layers, without shadows: times as fast as textured slices",
+            value=round(theirs.wall / ours.wall, 2), unit="x", better="higher", n=ours.n,
+            peer=f"slices {theirs.wall:.1f} ms, ours {ours.wall:.1f} ms",
+        )  # fmt: skip
 
 
 def camera_entries(mesh: Mesh, h: float, camera: Camera) -> tuple[shell.Shell, Entries, Int[Tensor, "n"]]:

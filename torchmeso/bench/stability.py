@@ -11,11 +11,12 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
+from itertools import chain
 from typing import TypeVar
 
 import torch
 
-from torchmeso.bench import extremes, fit_extremes, fuzz, fuzz_readers
+from torchmeso.bench import extremes, fit_extremes, fuzz, fuzz_readers, gdm_extremes
 from torchmeso.bench.extremes import Case
 from torchmeso.bench.suite import Context, Measurement, Row, resident_peak
 from torchmeso.compress import eigen
@@ -42,11 +43,20 @@ def pictures(context: Context) -> Iterator[Row]:
         yield from judge(case)
 
 
-def judge(case: Case) -> Iterator[Row]:
+def shells(context: Context) -> Iterator[Row]:
+    """The same for shells that carry a GDM."""
+    size = 64 if context.quick else 160
+    for case in gdm_extremes.cases(size):
+        yield from judge(case, "shell")
+    if not context.quick:
+        yield from judge(gdm_extremes.million(size), "shell")
+
+
+def judge(case: Case, group: str = "picture") -> Iterator[Row]:
     """Two rows of a case: values that are not finite, and the share of pixels that differ."""
     made = _attempt(case.make)
     if isinstance(made, str):
-        yield _row(f"picture.{case.name}.finite", f"{case.what}: no scene", math.inf, "values", 0, made)
+        yield _row(f"{group}.{case.name}.finite", f"{case.what}: no scene", math.inf, "values", 0, made)
         return
     truth = _draw("float64", *(case.truth or case.make)())
     drawn = {name: _draw(name, *made) for name in ("torch", "opencl")}
@@ -56,14 +66,14 @@ def judge(case: Case) -> Iterator[Row]:
     whole = [p for p in drawn.values() if isinstance(p, Picture)]
     lost = sum(map(_not_finite, whole)) + (2 - len(whole)) * 4 * made[1].width * made[1].height
     yield _row(
-        f"picture.{case.name}.finite", f"{case.what}: values that are not finite", lost, "values", 0,
+        f"{group}.{case.name}.finite", f"{case.what}: values that are not finite", lost, "values", 0,
         "; ".join(f"{name} {text}" for name, text in wrong.items()),
     )  # fmt: skip
     if isinstance(truth, str) or len(whole) < 2:
         return
     shares = {name: differing(p, truth, case.exposure) for name, p in zip(drawn, whole, strict=True)}
     yield _row(
-        f"picture.{case.name}.differ", f"{case.what}: pixels that differ from float64 by more than 1/255",
+        f"{group}.{case.name}.differ", f"{case.what}: pixels that differ from float64 by more than 1/255",
         round(max(shares.values()), 4), "% of pixels", case.bound,
         "; ".join(f"{name} {share:.3f}" for name, share in shares.items())
         + f"; between them {differing(whole[0], whole[1], case.exposure):.3f}",
@@ -72,7 +82,7 @@ def judge(case: Case) -> Iterator[Row]:
 
 def refused(context: Context) -> Iterator[Row]:
     """Every input that must be refused with one of our errors."""
-    for case in extremes.refusals():
+    for case in chain(extremes.refusals(), gdm_extremes.refusals()):
         said = _attempt(case.make)
         yield _row(
             f"refused.{case.name}", f"{case.what}: accepted, or a failure that is none of our errors",
@@ -227,6 +237,7 @@ def differing(a: Picture, b: Picture, exposure: float = 1.0) -> float:
 
 MEASUREMENTS = [
     Measurement("picture", pictures),
+    Measurement("shell", shells),
     Measurement("refused", refused),
     Measurement("grazing", grazing),
     Measurement("distance", distance),

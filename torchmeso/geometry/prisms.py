@@ -12,10 +12,13 @@ Test: tests/geometry/test_prisms.py
 """
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchmeso.geometry.mesh import Mesh
+
+THIN = 1e-6
+"""Height over length of UV triangles in which float32 texture coordinates do not tell where a point lies."""
 
 
 def to_world(
@@ -48,6 +51,15 @@ def barycentric(uv: Float[Tensor, "*batch 2"], triangle: Float[Tensor, "*batch 3
     return torch.stack([_cross(b - uv, c - uv), _cross(c - uv, a - uv), _cross(a - uv, b - uv)], -1) / area.unsqueeze(
         -1
     )
+
+
+def is_thin(triangle: Float[Tensor, "*batch 3 2"]) -> Bool[Tensor, "*batch"]:
+    """Return which UV triangles are as good as a line; of a point of theirs the middle is as good a guess as any."""
+    first, second = triangle[..., 1, :] - triangle[..., 0, :], triangle[..., 2, :] - triangle[..., 0, :]
+    length = torch.maximum(first.norm(dim=-1), second.norm(dim=-1))
+    # Texture coordinates far from 0 are no better known near each other.
+    rounded = THIN * torch.maximum(length, triangle.abs().amax((-1, -2)))
+    return _cross(first, second).abs() <= rounded * length
 
 
 def _cross(a: Tensor, b: Tensor) -> Tensor:

@@ -86,7 +86,8 @@ class Boundary(NamedTuple):
 def build(mesh: Mesh, h: float, *, side: Side = "inward") -> Shell:
     """Return the shell of depth `h` (tile units) around `mesh`.
 
-    Vertices at one position share a column, along the mean of their normals and as long as the mean of their scales.
+    Vertices at one position share a column, along the mean of their normals and as long as the mean of their scales. A
+    face that another one repeats carries no second prism: two in one place would have no neighbours.
 
     Args:
         mesh: the dressed mesh.
@@ -102,7 +103,7 @@ def build(mesh: Mesh, h: float, *, side: Side = "inward") -> Shell:
     corner = column[mesh.faces]
     a, b, c = corner.unbind(1)
     proper = (a != b) & (b != c) & (c != a)
-    face = proper.nonzero()[:, 0]
+    face = _first_of_each(corner, proper.nonzero()[:, 0])
     if not len(face):
         raise GeometryError("shell: expected at least one triangle with an area, got none")
     count = int(column.max()) + 1
@@ -171,6 +172,14 @@ def left_of(
     across, up = (q - p).unbind(-1)
     tie = torch.where(up == 0, torch.where(across == 0, p_id < q_id, across > 0), up < 0)
     return torch.where(area == 0, tie, area > 0)
+
+
+def _first_of_each(corner: Int[Tensor, "F 3"], face: Int[Tensor, "n"]) -> Int[Tensor, "m"]:
+    """Return those of `face` that none before has the same corners as, in the same sense."""
+    least = corner[face].argmin(1, keepdim=True)
+    turned = corner[face].gather(1, (least + torch.arange(3)) % 3)
+    first = np.unique(turned.numpy(), axis=0, return_index=True)[1]
+    return face[torch.from_numpy(np.sort(first))]
 
 
 def _columns(base: Tensor, way: Tensor, side: Side) -> Tensor:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchmeso.errors import ConfigError, check_range
 from torchmeso.meso.mesostructure import Mesostructure, Rgb, palette
-from torchmeso.meso.parts import DARK, Triangles, assemble, floor, shades, tube, turn
+from torchmeso.meso.parts import DARK, SEGMENTS, Triangles, assemble, floor, shades, tube, turn
 
 
 def grass(
@@ -116,6 +116,9 @@ def squama(
     """
     if rows < 2 or rows % 2 or columns < 1:
         raise ConfigError(f"squama: expected an even number of rows and at least one column, got {rows} x {columns}")
+    check_range("squama.rows", rows, 2, 64)
+    check_range("squama.columns", columns, 1, 64)
+    check_range("squama.segments", segments, *SEGMENTS)
     check_range("squama.overlap", overlap, 1, 4)
     check_range("squama.dome", dome, 0.01, 1)
     # Heights in steps from row to row: the tip, or the crest of the dome where that lies higher.
@@ -168,6 +171,7 @@ def peanut(
         ConfigError: a value is out of range, or so many do not find room.
     """
     check_range("peanut.count", count, 1, 400)
+    check_range("peanut.segments", segments, *SEGMENTS)
     check_range("peanut.waist", waist, 0.1, 0.99)
     check_range("peanut.smallest", smallest, 0.1, 1)
     rng = torch.Generator().manual_seed(seed)

@@ -24,6 +24,9 @@ Triangles = tuple[Tensor, Tensor]
 DARK: tuple[Rgb, float, float] = ((0.03, 0.03, 0.03), 1.0, 0.0)
 """Albedo, roughness and f0 of the sheet that closes the holes of an open structure."""
 
+SEGMENTS = 3, 512
+"""Facets around a round piece: fewest and most."""
+
 ALONG = 12
 """Pieces a straight bar is cut into along a tile: as fine as displaced meshes are refined, so they stay as they are."""
 
@@ -120,5 +123,5 @@ def tube(points: Float[Tensor, "along around 3"]) -> Triangles:
 
 def turn(segments: int) -> Float[Tensor, "segments"]:
     """Return the angles of the corners of a regular polygon, the first at 0."""
-    check_range("segments", segments, 3, 4096)
+    check_range("segments", segments, *SEGMENTS)
     return torch.arange(segments) * (2 * math.pi / segments)

@@ -45,6 +45,7 @@ def spheres(
 
     `segments` is the number of facets around the equator.
     """
+    check_range("spheres.count", count, 1, 64)
     check_range("spheres.radius", radius, 1e-3, 0.5 / count)
     check_range("spheres.h", h, radius, 10)
     ball = ellipsoid(radius, segments)

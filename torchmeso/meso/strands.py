@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchmeso.errors import ConfigError, check_range
 from torchmeso.meso.mesostructure import Mesostructure, Rgb, palette
-from torchmeso.meso.parts import DARK, Triangles, assemble, floor, straight, tube, turn
+from torchmeso.meso.parts import DARK, SEGMENTS, Triangles, assemble, floor, straight, tube, turn
 
 
 def weave(
@@ -47,6 +47,8 @@ def weave(
     """
     if count < 2 or count % 2:
         raise ConfigError(f"weave.count: expected an even number of yarns, got {count}")
+    check_range("weave.count", count, 2, 64)
+    check_range("weave.segments", segments, *SEGMENTS)
     check_range("weave.width", width, 0.05, 1)
     half_width, half_height = width / (2 * count), h / 4
     along = torch.arange(count * segments + 1) / (count * segments)
@@ -94,6 +96,7 @@ def pipes(
     Raises:
         ConfigError: the pipes do not fit beside each other or into the slab.
     """
+    check_range("pipes.count", count, 1, 64)
     check_range("pipes.radius", radius, 1e-3, 0.5 / count)
     check_range("pipes.h", h, radius * (4 if crossing else 2), 10)
     around = turn(segments)
@@ -141,6 +144,7 @@ def chain(
     """
     if links < 2 or links % 2:
         raise ConfigError(f"chain.links: expected an even number of links, got {links}")
+    check_range("chain.segments", segments, *SEGMENTS)
     check_range("chain.radius", radius, 2 * wire, 0.5 / links + wire)
     reach = radius * math.sqrt(0.5) + wire
     check_range("chain.count", count, 1, 0.5 / reach)

@@ -100,7 +100,7 @@ def read_body(item: ObjectConfig) -> Body:
     """
     if item.shape is not None:
         assert item.material is not None
-        return Body(item.build_shape(), None, (item.material,))
+        return _in_regions(item, Body(item.build_shape(), None, (item.material,)))
     assert item.mesh is not None
     found = mesh_file.read(item.mesh, uv_set=item.uv_set)
     looks = _looks(item, found.groups)
@@ -109,7 +109,30 @@ def read_body(item: ObjectConfig) -> Body:
     dressed, part = mesh.dress_parts(found, tiles=item.tiles_pair, name=item.mesh)
     kinds = list(dict.fromkeys(looks))
     part = torch.tensor([kinds.index(look) for look in looks])[part]
-    return Body(dressed, part if len(kinds) > 1 else None, tuple(kinds))
+    return _in_regions(item, Body(dressed, part if len(kinds) > 1 else None, tuple(kinds)))
+
+
+def _in_regions(item: ObjectConfig, body: Body) -> Body:
+    """Return a body whose faces in the regions of its object look as those say."""
+    if not item.regions:
+        return body
+    looks = list(dict.fromkeys([*body.looks, *(region.material for region in item.regions)]))
+    part = torch.zeros(len(body.mesh.faces), dtype=torch.long) if body.part is None else body.part.clone()
+    middle = body.mesh.vertices[body.mesh.faces].double().mean(1)
+    for region in item.regions:
+        low, high = (torch.tensor(x, dtype=torch.float64) for x in (region.low, region.high))
+        inside = ((middle >= low) & (middle <= high)).all(1)
+        if not bool(inside.any()):
+            raise ConfigError(
+                f"objects.regions: expected faces between {region.low} and {region.high}, got none; the mesh lies "
+                f"between {_short(middle.amin(0))} and {_short(middle.amax(0))}"
+            )
+        part[inside] = looks.index(region.material)
+    return Body(body.mesh, part, tuple(looks))
+
+
+def _short(point: Tensor) -> str:
+    return "(" + ", ".join(f"{x:.3g}" for x in point.tolist()) + ")"
 
 
 def build_mesh(item: ObjectConfig) -> Mesh:

@@ -218,6 +218,8 @@ def _picture_hash(picture: Picture) -> str:
 
 def _describe(material: MaterialConfig) -> object:
     if material.meso is not None:
-        return describe_meso(material.meso)
+        meso = describe_meso(material.meso)
+        in_shell = [material.shell.side, material.shell.base, material.floor]
+        return meso if material.gdm is None else [meso, in_shell]
     pictures = [file_hash(p) for p in (material.albedo_map, material.normal_map) if p is not None]
     return [material.albedo, *pictures]

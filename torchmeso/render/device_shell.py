@@ -13,6 +13,7 @@ from torch import Tensor
 from torchmeso.backends import opencl
 from torchmeso.errors import BackendError
 from torchmeso.geometry.mesh import Mesh
+from torchmeso.geometry.prisms import is_thin
 from torchmeso.geometry.shell import OUTWARD, Shell
 
 TET = np.dtype([("vertex", "i4", 4), ("ahead", "i4", 4), ("uv", "f4", (4, 2))])
@@ -98,7 +99,7 @@ def prism_records(shell: Shell, mesh: Mesh, first_record: int = 0) -> np.ndarray
     uv = mesh.uv.double()[corner]
     e1, e2 = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
     area = e1[:, 0] * e2[:, 1] - e1[:, 1] * e2[:, 0]
-    flat = area.abs() < 1e-30
+    flat = is_thin(uv)
     inverse = torch.where(flat, 0, 1 / torch.where(flat, 1, area))[:, None]
     records = np.zeros(len(shell.face), PRISM)
     records["corner"] = (corner + first_record).numpy()

@@ -73,12 +73,9 @@ def points(
         if len(mine) == 0:
             continue
         corner = placed.mesh.faces[placed.shell.face[prism[mine] - first]]
-        share = (
-            prisms.barycentric(place[mine, :2].double(), placed.mesh.uv.double()[corner])
-            .nan_to_num(1 / 3)
-            .clamp(0, 1)
-            .to(dtype)
-        )
+        triangle = placed.mesh.uv.double()[corner]
+        share = prisms.barycentric(place[mine, :2].double(), triangle)
+        share = torch.where(prisms.is_thin(triangle)[:, None], 1 / 3, share).clamp(0, 1).to(dtype)
         for name, column in columns.items():
             column[mine] = (share[..., None] * getattr(placed.mesh, name).to(dtype)[corner]).sum(1)
         scale[mine] = (share * placed.mesh.scale.to(dtype)[corner]).sum(1)
