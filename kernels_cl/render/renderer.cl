@@ -193,12 +193,14 @@ static void draw_stamp(const Place *place, const Target *target, const Rays *ray
 #ifdef GDM
     Matter matter;
     const Place3 in_slab = {seen->at.u, seen->at.v, seen->z};
+    const Vector3 towards = {-rays->direction.x, -rays->direction.y, -rays->direction.z};
+    const Vector3 wo = to_local(&seen->at, towards);
     for (int rest = shaded & seen->met; rest;) {
         int object;
         const int same = of_one_object(&seen->object, rest, &object);
         rest &= ~same;
         slack = from_bits(same) ? place->gdms[object].h * seen->at.scale : slack;
-        material_of(place->gdm_tables, place->gdms + object, &in_slab, seen->floor, same, &matter);
+        material_of(place->gdm_tables, place->gdms + object, &in_slab, wo, seen->floor, same, &matter);
     }
 #endif
     const float16 d = from_bits(shaded) ? seen->depth.vector : (float16)0.0f;

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -188,3 +190,20 @@ def test_one_layer_is_refused():
             distance=torch.zeros(1, 4, 4, 6, 8), left=torch.zeros(1, 4, 4, 6, 8, dtype=torch.bool),
             occupancy=torch.zeros(1, 4, 4), matter=torch.zeros(1, 4, 4, 10), h=0.1, cap=1.0,
         )  # fmt: skip
+
+
+def test_material_that_turns_away_does_not_count():
+    """A sheet thinner than a voxel: the corners know its two sides, and only the one towards the viewer is seen."""
+    gdm = layered(-0.2)
+    matter = torch.zeros(*gdm.voxels, 10)
+    matter[..., 2], matter[..., 3:6], matter[..., 6] = 1, torch.tensor([0.2, 0.4, 0.6]), 0.3
+    matter[:, :, ::2, 2], matter[:, :, ::2, 3] = -1, 0.8
+    gdm = replace(gdm, matter=matter)
+    place = torch.tensor([[0.5, 0.5, -0.1]]).repeat(3, 1)
+    wo = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.6, -0.8], [1.0, 0.0, 0.0]])
+    found = gdm.matter_at(place, wo)
+    torch.testing.assert_close(found.normal[:2], torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]))
+    torch.testing.assert_close(found.albedo[:2, 0], torch.tensor([0.2, 0.8]))
+    # Seen from the side no corner turns to the viewer: what is known of the material, and a normal that points up.
+    torch.testing.assert_close(found.normal[2], torch.tensor([0.0, 0.0, 1.0]))
+    assert 0.2 < float(found.albedo[2, 0]) < 0.8

@@ -134,16 +134,27 @@ class Gdm:
         """Return the way along `w` to the top or bottom of the slab, at most `cap`."""
         return gdm_query.boundary(self, place, w)
 
-    def matter_at(self, place: Float[Tensor, "*batch 3"]) -> Matter:
-        """Return the material around `place`, from the corners that have one; the normal is up where none has."""
+    def matter_at(self, place: Float[Tensor, "*batch 3"], wo: Float[Tensor, "*batch 3"] | None = None) -> Matter:
+        """Return the material around `place`, from the corners that have one; the normal is up where none has.
+
+        Args:
+            place: as of `evaluate`.
+            wo: (..., 3) unit, to the viewer: corners whose material turns away from there are of another side of
+                something thin, which cannot be seen. Where all do, the normal is up.
+        """
         voxel, weight, _ = gdm_query.corners(self, place)
         rows = self.matter.reshape(-1, 10).to(place.dtype)[voxel]
         known = weight * (rows[..., 6] > 0)
+        seen = torch.ones_like(known[..., :1], dtype=torch.bool)
+        if wo is not None:
+            facing = known * ((rows[..., :3] * wo.unsqueeze(-2)).sum(-1) > 0)
+            seen = facing.sum(-1, keepdim=True) > 1e-6
+            known = torch.where(seen, facing, known)
         mean = (known.unsqueeze(-1) * rows).sum(-2) / known.sum(-1, keepdim=True).clamp(min=1e-12)
         normal = mean[..., :3]
         length = torch.linalg.vector_norm(normal, dim=-1, keepdim=True)
         up = torch.tensor([0.0, 0.0, 1.0], dtype=place.dtype).expand_as(normal)
-        normal = torch.where(length > 1e-6, normal / length.clamp(min=1e-6), up)
+        normal = torch.where(seen & (length > 1e-6), normal / length.clamp(min=1e-6), up)
         return Matter(normal, mean[..., 3:6], mean[..., 6].clamp(min=0.02), mean[..., 7:])
 
     @cached_property

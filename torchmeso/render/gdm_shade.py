@@ -108,9 +108,10 @@ def shade(
         if dressing.gdm is None or len(mine) == 0:
             continue
         own = met.select(mine)
-        matter = _matter(dressing.gdm, own, dressing.albedo)
+        above = frames.to_local(own.frame, wo_world[mine])
+        matter = _matter(dressing.gdm, own, above, dressing.albedo)
         around = frames.around(matter.normal)
-        wo = frames.to_local(around, frames.to_local(own.frame, wo_world[mine]))
+        wo = frames.to_local(around, above)
         wo = torch.cat([wo[:, :2], wo[:, 2:].clamp(min=LEAST_COS)], -1)
         lit = torch.zeros(len(mine), dtype=torch.bool)
         found = torch.zeros_like(own.position)
@@ -158,9 +159,9 @@ def _asked(gdm: Gdm, start: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:
     return ~found.left & below, (found.distance <= 0) & ~found.left & below
 
 
-def _matter(gdm: Gdm, met: Met, albedo: tuple[float, float, float]) -> Matter:
-    """Return the material at points; of the floor, a diffuser."""
-    matter = gdm.matter_at(met.place)
+def _matter(gdm: Gdm, met: Met, wo: Float[Tensor, "n 3"], albedo: tuple[float, float, float]) -> Matter:
+    """Return the material at points seen from `wo` (local); of the floor, a diffuser."""
+    matter = gdm.matter_at(met.place, wo.to(met.place.dtype))
     dtype = met.place.dtype
     floor = met.floor[:, None]
     up, plain = (torch.tensor(x, dtype=dtype) for x in ((0.0, 0.0, 1.0), albedo))
