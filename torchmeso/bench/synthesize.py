@@ -6,8 +6,9 @@ neighbour's continuation are left out. Pictures are the quilting exemplars of th
 Test: tests/bench/test_synthesize.py
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -24,6 +25,7 @@ from torchmeso.data.quilting_map import QuiltingMap
 from torchmeso.geometry.directions import from_angles
 from torchmeso.pipeline import bake
 from torchmeso.render.scene import Scene, quilted
+from torchmeso.render.silhouette import Silhouette
 from torchmeso.synthesize import patch_error, quilting, seam_dp
 from torchmeso.synthesize.patch_error import Exemplar, Search
 from torchmeso.synthesize.quilting import QuiltingOptions
@@ -107,7 +109,10 @@ def by_hand(source: Exemplar, target: Int[Tensor, "h w C"], mask: Tensor) -> Int
 def seams_by_dp(context: Context) -> Iterator[Row]:
     """Compiled seams."""
     e = torch.randint(0, 1 << 20, (64, 64, 16), generator=torch.Generator().manual_seed(0))
-    calls = {name: lambda name=name: seam_dp.cut(e, left=16, backend=name) for name in ("opencl", "torch")}
+    calls: dict[str, Callable[[], object]] = {
+        "opencl": partial(seam_dp.cut, e, left=16, backend="opencl"),
+        "torch": partial(seam_dp.cut, e, left=16, backend="torch"),
+    }
     timing = time_together(calls, n=9 if context.quick else 25)
     yield Row(
         id="synthesize.seam_dp.64", what="64 seams of 64 x 16 texels on OpenCL, call and copies included",
@@ -185,16 +190,17 @@ def frame_cost(context: Context) -> Iterator[Row]:
     assert isinstance(look, EigenBtf)
     laid = _laid(scene, _quilt(look, toroidal=True))
     camera = frames.camera_at(scene, timed, 0.5)
-    for name, silhouette, filtering in (
+    kinds: tuple[tuple[str, Silhouette, bool], ...] = (
         ("btf", "none", False),
         ("filtered", "none", True),
         ("silhouette", "curved", True),
-    ):
+    )
+    for name, silhouette, filtering in kinds:
         shown = {
             kind: speed.renderer(s, silhouette, shadows=False, filtering=filtering)
             for kind, s in (("plain", scene), ("quilted", laid))
         }
-        calls = {kind: (lambda r=r: r.show(camera)) for kind, r in shown.items()}
+        calls: dict[str, Callable[[], object]] = {kind: partial(r.show, camera) for kind, r in shown.items()}
         timing = time_together(calls, n=9 if context.quick else 25, warm=3, settle=2)
         plain, own = timing["plain"], timing["quilted"]
         yield Row(

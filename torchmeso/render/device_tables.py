@@ -58,7 +58,7 @@ MDF = np.dtype(
 
 QUILT = np.dtype(
     [(name, "i4") for name in ("height", "width", "source_height", "source_width")]
-    + [("across", "f4"), ("down", "f4"), ("pad", "i4", 10)]
+    + [("across", "f4"), ("down", "f4"), ("per_across", "f4"), ("per_down", "f4"), ("pad", "i4", 8)]
 )
 
 ADDRESSES = {
@@ -360,6 +360,7 @@ def _quilt(pool: "_Pool", quilting: QuiltingMap) -> int:
         quilting.texels, quilting.source,
     )  # fmt: skip
     record["across"], record["down"] = quilting.periods
+    record["per_across"], record["per_down"] = (1 / period for period in quilting.periods)
     index, columns = quilting.index.numpy(), quilting.source[1]
     first = pool.add(record)
     pool.add((index // columns << 16 | index % columns).astype(np.int32))
