@@ -87,11 +87,12 @@ __kernel void draw_band(__global const int *restrict faces, __global const float
                         __global const float *restrict matter,     // (slice, rows, columns, 10)
                         __global const float *restrict frames,     // (V, 3, 3) t, b, n
                         const int n_vertex, const int slices, const int rows, const int columns, const int width,
-                        const int height, const int floor_below, const float4 light, const float4 power,
-                        const float4 ground,                       // albedo of the floor; w: ambient
+                        const int height, const int floor_below,
+                        __global const float4 *restrict lighting,  // direction, irradiance; floor's albedo and ambient
                         __global float *restrict depth,            // (H, W) 1 / depth, 0: nothing
                         __global float4 *restrict rgb)             // (H, W)
 {
+    const float4 light = lighting[0], power = lighting[1], ground = lighting[2];
     const int band = get_group_id(0), top = band * BAND, across = (width + 3) / 4;
     const float16 lane_x = (float16)(0.5f, 1.5f, 2.5f, 3.5f, 0.5f, 1.5f, 2.5f, 3.5f, 0.5f, 1.5f, 2.5f, 3.5f, 0.5f,
                                      1.5f, 2.5f, 3.5f);

@@ -24,6 +24,7 @@ def test_names_are_unique():
         assert len(set(names)) == len(names)
 
 
+@pytest.mark.errors
 @pytest.mark.parametrize("case", [*gdm_extremes.refusals()], ids=lambda c: c.name)
 def test_what_is_no_shell_is_refused(case):
     with pytest.raises(MesoError):

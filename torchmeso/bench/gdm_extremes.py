@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache, partial
+from typing import Literal
 
 import torch
 
@@ -22,6 +23,8 @@ from torchmeso.meso.bake_gdm import GdmOptions
 from torchmeso.render.scene import Material, Object, Scene, ShellOptions
 
 OPTIONS = GdmOptions(texels=16, layers=8, n_theta=8, n_phi=16)
+
+Base = Literal["solid", "open"]
 
 BOUND = 0.3
 """Percent of pixels that may differ from float64: where a table is about to change its mind, rounding decides."""
@@ -99,7 +102,7 @@ def _case(
 
 
 def _on(
-    mesh: Mesh, gdm: Gdm | None = None, *, side: shell.Side = "inward", base="solid", floor: bool = True
+    mesh: Mesh, gdm: Gdm | None = None, *, side: shell.Side = "inward", base: Base = "solid", floor: bool = True
 ) -> tuple[Object, ...]:
     """Return a mesh in a shell, above a plain floor."""
     material = Material(gdm=gdm or table("weave"), shell=ShellOptions(side=side, base=base), albedo=(0.2, 0.4, 0.3))
@@ -173,8 +176,9 @@ def _meshes(size: int) -> Iterator[Case]:
     yield _case("turned_normals", "normals into the body", lambda: _on(against), size)
     level = replace(small_torus(), normals=small_torus().tangents)
     yield _case("level_normals", "normals along the surface", lambda: _on(level), size)
+    kinds: tuple[tuple[shell.Side, Base], ...] = (("inward", "solid"), ("outward", "open"))
     for name, (what, *arrays) in extremes.raw_meshes().items():
-        for side, base in (("inward", "solid"), ("outward", "open")):
+        for side, base in kinds:
             yield _case(
                 f"mesh_{name}_{side}", f"{what}, {side}",
                 lambda a=arrays, s=side, b=base: _on(dressed(*a), side=s, base=b), size,

@@ -57,7 +57,7 @@ class Slices:
         self._counts = opencl.Shared(np.zeros((self._bands, self._slices), np.int32))
         self._begins = opencl.Shared(np.zeros((self._bands, self._slices + 1), np.int32))
         self._next = opencl.Shared(np.zeros((self._bands, self._slices), np.int32))
-        size = np.int32(camera.width), np.int32(camera.height)
+        size, pixels = (np.int32(camera.width), np.int32(camera.height)), camera.width * camera.height
         n_vertex = np.int32(self._n_vertex)
         self._project = opencl.Call(
             "bench/slices.cl", "project", (self._slices * self._n_vertex,), (1,),
@@ -70,18 +70,19 @@ class Slices:
             (faces, corners, n_vertex, np.int32(n_face), *size, self._counts.buffer), self._options,
         )  # fmt: skip
         codes = (gdm.occupancy * 255).round().to(torch.uint8).numpy()
-        self._depth, self._rgb = opencl.allocate(4 * size[0] * size[1]), opencl.allocate(16 * size[0] * size[1])
+        self._depth, self._rgb = opencl.allocate(4 * pixels), opencl.allocate(16 * pixels)
         volume = (
             opencl.upload(codes), opencl.upload(gdm.matter.float().numpy()),
             opencl.upload(torch.stack([frame.t, frame.b, frame.n], 1).float().numpy()),
         )  # fmt: skip
-        towards, power = np.zeros(4, np.float32), np.zeros(4, np.float32)
-        towards[:3], power[:3] = light.direction.numpy(), light.irradiance.numpy()
+        lighting = np.zeros((3, 4), np.float32)
+        lighting[0, :3], lighting[1, :3] = light.direction.numpy(), light.irradiance.numpy()
+        lighting[2] = 0.6, 0.6, 0.6, ambient
         self._for_lists = (faces, corners, n_vertex, np.int32(n_face), *size, self._next.buffer), each
         self._for_bands = (
             (faces, corners, opencl.upload(mesh.uv.float().numpy()), self._begins.buffer),
             (*volume, n_vertex, np.int32(self._slices), np.int32(rows), np.int32(columns), *size, np.int32(floor),
-             towards, power, np.array([0.6, 0.6, 0.6, ambient], np.float32), self._depth, self._rgb),
+             opencl.upload(lighting), self._depth, self._rgb),
         )  # fmt: skip
         self._make_room(1 << 16)
 
