@@ -199,7 +199,7 @@ def test_material_that_turns_away_does_not_count():
     matter[..., 2], matter[..., 3:6], matter[..., 6] = 1, torch.tensor([0.2, 0.4, 0.6]), 0.3
     matter[:, :, ::2, 2], matter[:, :, ::2, 3] = -1, 0.8
     gdm = replace(gdm, matter=matter)
-    place = torch.tensor([[0.5, 0.5, -0.1]]).repeat(3, 1)
+    place = torch.tensor([[1 / gdm.voxels[2], 0.5, -0.1]]).repeat(3, 1)  # between two columns
     wo = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.6, -0.8], [1.0, 0.0, 0.0]])
     found = gdm.matter_at(place, wo)
     torch.testing.assert_close(found.normal[:2], torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]))
