@@ -7,7 +7,7 @@ are averaged. `data.gdm` says what the cases are and how distances are carried t
 Test: tests/data/test_gdm.py
 """
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -38,6 +38,7 @@ class Query(NamedTuple):
     near: Float[Tensor, "*batch"]
 
 
+@runtime_checkable
 class Sampled(Protocol):
     """Samples over voxels and directions: `data.gdm.Gdm`, or `data.gdm_svd.GdmSvd`."""
 
