@@ -273,5 +273,7 @@ def _meet(
         # way does, from there on, whatever the number of queries.
         step = torch.where(found.left | last, found.distance, found.distance - gdm.voxel)
         d[active] = torch.minimum(d[active] + step, length[active])
-        active = active[~stops & ~beyond & (found.distance > 1e-9)]
+        # A way that leaves the slab is over; one that is longer than the table knows goes on.
+        on = ~found.left | (found.distance >= 0.9999 * gdm.cap)
+        active = active[~stops & ~beyond & on & (found.distance > 1e-9)]
     return met, d, near, sunk
