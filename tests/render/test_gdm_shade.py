@@ -16,7 +16,7 @@ from torchmeso.render.frame import FrameOptions, Skips
 from torchmeso.render.renderer import Renderer
 from torchmeso.render.scene import Material, Object, Scene, ShellOptions
 
-OPTIONS = FrameOptions(shadow_map_size=128)
+OPTIONS = FrameOptions(shadow_map_size=128, skips=Skips(carried=False))  # what torch does
 
 
 @pytest.fixture(scope="module")

@@ -22,6 +22,7 @@ from torchmeso.geometry.rays import RayScene
 from torchmeso.meso import generators
 from torchmeso.meso.bake_gdm import GdmOptions, RayCastGdm
 from torchmeso.meso.displace import displace
+from torchmeso.render import device_gdm
 from torchmeso.render.device_trace import DeviceTrace
 
 NEAR = 8
@@ -94,7 +95,10 @@ def against_rays(gdm: Gdm, rays: RayCastGdm, n: int, *, queries: int = 1) -> Err
 
 
 def silhouette(context: Context) -> Iterator[Row]:
-    """A weave in a shell beside the same weave as triangles: outline and depth, over voxels and look-ups per prism."""
+    """A weave in a shell beside the same weave as triangles: outline and depth, over voxels and look-ups per prism.
+
+    Rays walk as those of frames do.
+    """
     mesh, camera = shapes.torus(triangles=12000, tiles=(5, 2)), view()
     twin = displace(mesh, generators.weave(backing=True), max_edge=0.05)
     scene = RayScene(twin.vertices, twin.faces)
@@ -108,7 +112,7 @@ def silhouette(context: Context) -> Iterator[Row]:
         right = right.reshape(SIZE, SIZE)
         close = near_outline(right)
         for queries in (1,) if context.quick else (1, 2, 4, 8):
-            device = DeviceTrace(built, mesh, gdm, queries=queries)
+            device = DeviceTrace(built, mesh, gdm, queries=queries, bend=device_gdm.BEND * gdm.voxel)
             found = device.trace(entries)
             mask = torch.zeros(SIZE * SIZE, dtype=torch.bool)
             mask[pixel[found.hit]] = True
@@ -167,7 +171,7 @@ def distortion(context: Context) -> Iterator[Row]:
             twin = displace(body(16 * 500), generators.weave(backing=True), max_edge=0.05)
             built, entries, _ = camera_entries(mesh, gdm.h, view())
             hits = RayScene(twin.vertices, twin.faces).first_hit(entries.origin.float(), entries.direction.float())
-            found = DeviceTrace(built, mesh, gdm).trace(entries)
+            found = DeviceTrace(built, mesh, gdm, bend=device_gdm.BEND * gdm.voxel).trace(entries)
             both = found.hit & (hits.face >= 0)
             off = (found.t - hits.t.double()).abs()[both] / float(mesh.scale.mean())
             yield Row(

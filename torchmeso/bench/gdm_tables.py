@@ -22,6 +22,7 @@ from torchmeso.geometry.rays import RayScene
 from torchmeso.meso import generators
 from torchmeso.meso.bake_gdm import GdmOptions, RayCastGdm
 from torchmeso.meso.displace import displace
+from torchmeso.render import device_gdm
 from torchmeso.render.device_trace import DeviceTrace
 
 RANKS = (2, 4, 8, 16, 32)
@@ -68,7 +69,8 @@ def tables(context: Context) -> Iterator[Row]:
     for form in forms(direct, half, ranks, allowed, context.report):
         found = against_rays(form.gdm, rays, 60_000)
         mask = torch.zeros(SIZE * SIZE, dtype=torch.bool)
-        mask[pixel[DeviceTrace(built, mesh, form.gdm).trace(entries).hit]] = True
+        traced = DeviceTrace(built, mesh, form.gdm, bend=device_gdm.BEND * form.gdm.voxel).trace(entries)
+        mask[pixel[traced.hit]] = True
         off = quality.boundary_distance(mask.reshape(SIZE, SIZE), right.reshape(SIZE, SIZE))
         curve = {"series": form.series, "x": (form.stored or form.held) / 1e6}
         yield Row(

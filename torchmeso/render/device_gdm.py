@@ -25,6 +25,9 @@ GDM = np.dtype(
 LEFT, SOLID = 255, 254
 """Codes of a table that are no distance."""
 
+BEND = 1.0
+"""Voxels that a way through a shell may turn from a straight one, in frames, before its table is asked again."""
+
 BLOCK, BRICK = 64, (2, 4, 4)
 """Bytes that tables are aligned to; layers, rows and columns of voxels that stand together."""
 

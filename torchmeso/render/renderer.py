@@ -40,9 +40,6 @@ MAX_LIGHTS = 64
 DETAILS, DISPLAY = 1, 2
 """What a frame writes: a `Picture`, or bytes for a screen."""
 
-BEND = 1.0
-"""Voxels that a way through a shell may turn from a straight one before its table is asked again."""
-
 MOST_STARTS = 4
 """Tetrahedra of shells that the eye is in; the others of a shell that overlaps itself more often are left out."""
 
@@ -441,7 +438,7 @@ def _dressing(material: Material, skips: Skips) -> device_gdm.Dressing | None:
     gdm, form = material.gdm, material.shell
     if gdm is None:
         return None
-    bend = BEND * gdm.voxel if skips.carried else 0.0
+    bend = device_gdm.BEND * gdm.voxel if skips.carried else 0.0
     return device_gdm.Dressing(gdm, gdm.h, form.queries, form.base == "solid", material.albedo, bend)
 
 
