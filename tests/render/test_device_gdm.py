@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -47,13 +49,25 @@ def test_codes_are_those_of_the_table(weave):
 def test_matter_keeps_its_values():
     gdm = layered(-0.2)
     gdm.matter[4:] = 0
-    codes = device_gdm.matter_codes(gdm) / 65535
+    words = device_gdm.matter_codes(gdm).astype(np.uint32)
     rows = gdm.matter.reshape(-1, 10).numpy()
     near = rows[:, 6] > 0
-    np.testing.assert_allclose(codes[near, :3] * 2 - 1, rows[near, :3], atol=1e-4)
-    np.testing.assert_allclose(codes[near, 3:10], rows[near, 3:], atol=1e-4)
-    assert (codes[near, 10] == 1).all()
-    assert not codes[~near].any()
+    normal = np.stack([words[near, 0] >> shift & 1023 for shift in (0, 10, 20)], -1)
+    np.testing.assert_allclose(normal / 1023 * 2 - 1, rows[near, :3], atol=1e-3)
+    halves = np.stack([words[near, 1 + c // 2] >> 16 * (c % 2) & 0xFFFF for c in range(7)], -1)
+    np.testing.assert_allclose(halves / 65535, rows[near, 3:], atol=1e-5)
+    assert (words[near, 0] >> 30 == 1).all()
+    assert not words[~near].any()
+
+
+@pytest.mark.parametrize(("varied", "one_albedo", "one_coat"), [(3, False, True), (6, True, False), (9, True, False)])
+def test_what_all_material_shares_is_told(weave, varied, one_albedo, one_coat):
+    """Voxels without material do not count."""
+    matter = torch.full_like(weave.matter, 0.5)
+    assert device_gdm.same_everywhere(replace(weave, matter=matter))[:2] == (True, True)
+    matter[..., varied] *= torch.linspace(0.5, 1, matter.shape[2])[:, None].expand(matter.shape[1:3])
+    matter[0] = 0
+    assert device_gdm.same_everywhere(replace(weave, matter=matter))[:2] == (one_albedo, one_coat)
 
 
 def test_tables_stay_while_they_are_the_same(weave):

@@ -89,6 +89,11 @@ def dressed(weave, kind):
         shell = ShellOptions(side="outward")
     if kind == "point":
         lights = (PointLight(position=torch.tensor([1.0, 2.5, 1.0]), intensity=torch.full((3,), 20.0)), *lights)
+    if kind == "coat":
+        matter = weave.matter.clone()
+        matter[..., 6] *= torch.linspace(0.3, 1, matter.shape[2])
+        matter[..., 7:] = 0.04 * matter[..., :1].abs()
+        weave = replace(weave, matter=matter)
     material = Material(gdm=weave, shell=shell, albedo=(0.4, 0.2, 0.2))
     one = Object(mesh=body, material=material)
     if kind == "parts":
@@ -100,7 +105,7 @@ def dressed(weave, kind):
     return Scene(objects=objects, lights=lights, ambient=0.1)
 
 
-@pytest.mark.parametrize("kind", ["solid", "open", "outward", "point", "parts", "below"])
+@pytest.mark.parametrize("kind", ["solid", "open", "outward", "point", "parts", "below", "coat"])
 def test_opencl_shows_what_torch_shows(weave, kind):
     scene = dressed(weave, kind)
     eye = camera((1.5, -2.5 if kind == "below" else 2.5, 2.0), size=48)

@@ -9,7 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import UInt8, UInt16
+from jaxtyping import Float, Int32, UInt8
+from torch import Tensor
 
 from torchmeso.backends import opencl
 from torchmeso.data.gdm import Gdm
@@ -18,7 +19,8 @@ from torchmeso.geometry import sphere
 GDM = np.dtype(
     [(name, "i4") for name in ("there", "layers", "height", "width", "n_theta", "n_phi", "table")]
     + [(name, "i4") for name in ("per_phi", "per_row", "matter", "queries", "floor")]
-    + [("h", "f4"), ("cap", "f4"), ("unit", "f4"), ("albedo", "f4", 3), ("bend", "f4"), ("pad", "i4")]
+    + [("h", "f4"), ("cap", "f4"), ("unit", "f4"), ("albedo", "f4", 3), ("bend", "f4")]
+    + [("one_albedo", "i4"), ("one_coat", "i4"), ("mean", "f4", 7)]
 )
 """See `Gdm` in kernels_cl/data/gdm.clh."""
 
@@ -27,6 +29,8 @@ LEFT, SOLID = 255, 254
 
 BEND = 1.0
 """Voxels that a way through a shell may turn from a straight one, in frames, before its table is asked again."""
+
+MATTER_WORDS = 5
 
 BLOCK, BRICK = 64, (2, 4, 4)
 """Bytes that tables are aligned to; layers, rows and columns of voxels that stand together."""
@@ -83,7 +87,7 @@ def upload_gdms(dressings: Sequence[Dressing | None], before: DeviceGdms | None 
     )
     for gdm in sources:
         at = []
-        for size in (table_bytes(gdm), 32 * gdm.occupancy.numel()):
+        for size in (table_bytes(gdm), 4 * MATTER_WORDS * gdm.occupancy.numel()):
             at.append(blocks)
             blocks += -(-size // BLOCK)
         places[id(gdm)] = at
@@ -110,6 +114,7 @@ def upload_gdms(dressings: Sequence[Dressing | None], before: DeviceGdms | None 
         record["table"], record["matter"] = places[id(d.gdm)]
         record["per_row"] = _voxels(d.gdm)
         record["per_phi"] = record["per_row"] * (d.gdm.directions.n_theta + 1)
+        record["one_albedo"], record["one_coat"], record["mean"] = same_everywhere(d.gdm)
         record["cap"], record["unit"] = d.gdm.cap, d.gdm.cap / 255
     return DeviceGdms(tables, opencl.upload(records), sources)
 
@@ -149,12 +154,24 @@ def table_codes(gdm: Gdm) -> UInt8[np.ndarray, "byte"]:
     return torch.cat([pairs, pairs.roll(-1, 0)], -1).flatten().numpy()
 
 
-def matter_codes(gdm: Gdm) -> UInt16[np.ndarray, "voxel 16"]:
-    """Return the material of voxels as kernels read it, (voxels, 16) ushort."""
+def matter_codes(gdm: Gdm) -> Int32[np.ndarray, "voxel word"]:
+    """Return the material of voxels as kernels read it, (voxels, MATTER_WORDS): see `Matter` in gdm.clh."""
     rows = gdm.matter.reshape(-1, 10).float()
     known = rows[:, 6] > 0
-    whole = torch.zeros(len(rows), 16)
-    whole[:, :3] = 0.5 + 0.5 * rows[:, :3]
-    whole[:, 3:10] = rows[:, 3:10]
-    whole[:, 10] = 1
-    return (whole.clamp(0, 1) * known[:, None] * 65535).round().numpy().astype(np.uint16)
+    normal = ((0.5 + 0.5 * rows[:, :3]).clamp(0, 1) * 1023).round().long()
+    r, g, b, alpha, *f0 = (rows[:, 3:].clamp(0, 1) * 65535).round().long().unbind(1)
+    words = [
+        normal[:, 0] | normal[:, 1] << 10 | normal[:, 2] << 20 | 1 << 30,
+        r | g << 16, b | alpha << 16, f0[0] | f0[1] << 16, f0[2],
+    ]  # fmt: skip
+    return torch.where(known[:, None], torch.stack(words, 1), 0).numpy().astype(np.uint32).view(np.int32)
+
+
+def same_everywhere(gdm: Gdm) -> tuple[bool, bool, Float[Tensor, "7"]]:
+    """Return whether all material has one albedo, whether it has one coat, and albedo, alpha and f0 of one voxel."""
+    rows = gdm.matter.reshape(-1, 10)[:, 3:].float()
+    rows = rows[rows[:, 3] > 0]
+    if not len(rows):
+        return True, True, torch.zeros(7)
+    same = (rows.amax(0) - rows.amin(0)) < 1 / 65535
+    return bool(same[:3].all()), bool(same[3:].all()), rows[0].clamp(0, 1)
