@@ -68,7 +68,8 @@ def _writable() -> list[tuple[int, int]]:
     except OSError:
         return []
     spans = (line.split()[:2] for line in lines)
-    return [tuple(int(x, 16) for x in span.split("-")) for span, rights in spans if rights.startswith("rw")]
+    edges = (span.split("-") for span, rights in spans if rights.startswith("rw"))
+    return [(int(first, 16), int(last, 16)) for first, last in edges]
 
 
 def _inside(spans: list[tuple[int, int]], at: int, size: int) -> bool:

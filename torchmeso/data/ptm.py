@@ -65,7 +65,8 @@ class Ptm:
 
         Coefficients, which are linear, are interpolated between texels.
         """
-        taps = address.bilinear(uv, *self.codes.shape[:2])
+        height, width = self.codes.shape[:2]
+        taps = address.bilinear(uv, height, width)
         codes = _interpolate(self.codes.flatten(0, 1), taps)
         a = (codes - self.bias.to(uv.dtype)) * self.scale.to(uv.dtype)
         srgb = (a * basis(wi).unsqueeze(-2)).sum(-1) / 255
