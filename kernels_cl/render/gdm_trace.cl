@@ -51,8 +51,8 @@ static INNER void trace_sixteen(__global const Ray *rays, const Shells *shells, 
 }
 
 __kernel __attribute__((reqd_work_group_size(1, 1, 1)))
-void trace(__global const Ray *restrict rays, __global const uchar *restrict tets,
-           __global const uchar *restrict vertices, __global const Prism *restrict prisms,
+void trace(__global const Ray *restrict rays, __global const float4 *restrict tets,
+           __global const float4 *restrict vertices, __global const Prism *restrict prisms,
            __global const uchar *restrict tables, __global const Gdm *restrict gdm, const int n_ray,
            __global Answer *restrict answers, __global int *restrict counted)
 {

@@ -16,8 +16,8 @@ from torchmeso.geometry.mesh import Mesh
 from torchmeso.geometry.prisms import is_thin
 from torchmeso.geometry.shell import OUTWARD, Shell
 
-TET = np.dtype([("vertex", "i4", 4), ("ahead", "i4", 4), ("uv", "f4", (4, 2))])
-"""A tetrahedron in one line of the cache; what stands in `ahead` says the kernel."""
+CORNER = np.dtype([("uv", "f4", 2), ("vertex", "i4"), ("ahead", "i4")])
+"""A corner of a tetrahedron, four of them in one line of the cache; what stands in `ahead` says the kernel."""
 
 PRISM = np.dtype(
     [("corner", "i4", 3), ("pad", "i4")]
@@ -33,8 +33,8 @@ class DeviceShells(NamedTuple):
     """Shells on the device, one behind the other.
 
     Attributes:
-        tets: see `TET`.
-        vertices: float4.
+        tets: four of each, see `CORNER`.
+        vertices: float4: position, and 0 at the bottom of the shell and 1 at its top.
         prisms: see `PRISM`.
     """
 
@@ -55,11 +55,12 @@ def upload_shells(shells: list[tuple[Shell, Mesh, int]]) -> DeviceShells:
     count = sum(len(s.tets) for s, _, _ in shells)
     if count > MOST_TETS:
         raise BackendError(f"opencl: expected at most {MOST_TETS // 3} prisms, got {count // 3}; use the torch backend")
-    tets, vertices, prisms = [np.zeros(0, TET)], [np.zeros((0, 4), np.float32)], [np.zeros(0, PRISM)]
+    tets, vertices, prisms = [np.zeros((0, 4), CORNER)], [np.zeros((0, 4), np.float32)], [np.zeros(0, PRISM)]
     first_tet = first_vertex = 0
     for shell, mesh, first_record in shells:
         tets.append(tet_records(shell, first_tet, first_vertex))
-        vertices.append(torch.nn.functional.pad(shell.vertices.float(), (0, 1)).numpy())
+        level = (torch.arange(len(shell.vertices)) % 2)[:, None]
+        vertices.append(torch.cat([shell.vertices.float(), level], 1).numpy())
         prisms.append(prism_records(shell, mesh, first_record))
         first_tet += len(shell.tets)
         first_vertex += len(shell.vertices)
@@ -67,8 +68,8 @@ def upload_shells(shells: list[tuple[Shell, Mesh, int]]) -> DeviceShells:
 
 
 def tet_records(shell: Shell, first_tet: int = 0, first_vertex: int = 0) -> np.ndarray:
-    """Return the tetrahedra of a shell that stands behind others; see `TET`."""
-    records = np.zeros(len(shell.tets), TET)
+    """Return the tetrahedra of a shell that stands behind others, (T, 4); see `CORNER`."""
+    records = np.zeros((len(shell.tets), 4), CORNER)
     records["vertex"] = (shell.tets + first_vertex).numpy()
     records["uv"] = shell.uvz[..., :2].float().numpy()
     records["ahead"] = _ahead(shell, first_tet).numpy()
