@@ -54,20 +54,22 @@ def test_matter_keeps_its_values():
     near = rows[:, 6] > 0
     normal = np.stack([words[near, 0] >> shift & 1023 for shift in (0, 10, 20)], -1)
     np.testing.assert_allclose(normal / 1023 * 2 - 1, rows[near, :3], atol=1e-3)
-    halves = np.stack([words[near, 1 + c // 2] >> 16 * (c % 2) & 0xFFFF for c in range(7)], -1)
-    np.testing.assert_allclose(halves / 65535, rows[near, 3:], atol=1e-5)
+    halves = np.stack([words[near, 1 + c // 2] >> 16 * (c % 2) & 0xFFFF for c in range(4)], -1)
+    np.testing.assert_allclose(halves / 65535, rows[near, 3:7], atol=1e-5)
+    roots = np.stack([words[near, 3] >> shift & 1023 for shift in (0, 10, 20)], -1)
+    np.testing.assert_allclose((roots / 1023) ** 2, rows[near, 7:], atol=5e-4)
     assert (words[near, 0] >> 30 == 1).all()
     assert not words[~near].any()
 
 
-@pytest.mark.parametrize(("varied", "one_albedo", "one_coat"), [(3, False, True), (6, True, False), (9, True, False)])
-def test_what_all_material_shares_is_told(weave, varied, one_albedo, one_coat):
-    """Voxels without material do not count."""
+@pytest.mark.parametrize(("varied", "same"), [(3, True), (6, False), (9, False)])
+def test_a_coat_that_all_material_shares_is_told(weave, varied, same):
+    """Voxels without material do not count, and colours do not."""
     matter = torch.full_like(weave.matter, 0.5)
-    assert device_gdm.same_everywhere(replace(weave, matter=matter))[:2] == (True, True)
-    matter[..., varied] *= torch.linspace(0.5, 1, matter.shape[2])[:, None].expand(matter.shape[1:3])
     matter[0] = 0
-    assert device_gdm.same_everywhere(replace(weave, matter=matter))[:2] == (one_albedo, one_coat)
+    assert device_gdm.one_coat(replace(weave, matter=matter))[0]
+    matter[..., varied] *= torch.linspace(0.5, 1, matter.shape[2])
+    assert device_gdm.one_coat(replace(weave, matter=matter))[0] is same
 
 
 def test_tables_stay_while_they_are_the_same(weave):

@@ -20,7 +20,7 @@ GDM = np.dtype(
     [(name, "i4") for name in ("there", "layers", "height", "width", "n_theta", "n_phi", "table")]
     + [(name, "i4") for name in ("per_phi", "per_row", "matter", "queries", "floor")]
     + [("h", "f4"), ("cap", "f4"), ("unit", "f4"), ("albedo", "f4", 3), ("bend", "f4")]
-    + [("one_albedo", "i4"), ("one_coat", "i4"), ("mean", "f4", 7)]
+    + [("one_coat", "i4"), ("coat", "f4", 4)]
 )
 """See `Gdm` in kernels_cl/data/gdm.clh."""
 
@@ -29,8 +29,6 @@ LEFT, SOLID = 255, 254
 
 BEND = 1.0
 """Voxels that a way through a shell may turn from a straight one, in frames, before its table is asked again."""
-
-MATTER_WORDS = 5
 
 BLOCK, BRICK = 64, (2, 4, 4)
 """Bytes that tables are aligned to; layers, rows and columns of voxels that stand together."""
@@ -87,7 +85,7 @@ def upload_gdms(dressings: Sequence[Dressing | None], before: DeviceGdms | None 
     )
     for gdm in sources:
         at = []
-        for size in (table_bytes(gdm), 4 * MATTER_WORDS * gdm.occupancy.numel()):
+        for size in (table_bytes(gdm), 16 * gdm.occupancy.numel()):
             at.append(blocks)
             blocks += -(-size // BLOCK)
         places[id(gdm)] = at
@@ -114,7 +112,7 @@ def upload_gdms(dressings: Sequence[Dressing | None], before: DeviceGdms | None 
         record["table"], record["matter"] = places[id(d.gdm)]
         record["per_row"] = _voxels(d.gdm)
         record["per_phi"] = record["per_row"] * (d.gdm.directions.n_theta + 1)
-        record["one_albedo"], record["one_coat"], record["mean"] = same_everywhere(d.gdm)
+        record["one_coat"], record["coat"] = one_coat(d.gdm)
         record["cap"], record["unit"] = d.gdm.cap, d.gdm.cap / 255
     return DeviceGdms(tables, opencl.upload(records), sources)
 
@@ -154,24 +152,36 @@ def table_codes(gdm: Gdm) -> UInt8[np.ndarray, "byte"]:
     return torch.cat([pairs, pairs.roll(-1, 0)], -1).flatten().numpy()
 
 
-def matter_codes(gdm: Gdm) -> Int32[np.ndarray, "voxel word"]:
-    """Return the material of voxels as kernels read it, (voxels, MATTER_WORDS): see `Matter` in gdm.clh."""
+def matter_codes(gdm: Gdm) -> Int32[np.ndarray, "voxel 4"]:
+    """Return the material of voxels as kernels read it; see `matter` in kernels_cl/data/gdm.clh.
+
+    Normals have 10 bits a channel, albedo and alpha 16, the square root of f0 10.
+    """
     rows = gdm.matter.reshape(-1, 10).float()
     known = rows[:, 6] > 0
-    normal = ((0.5 + 0.5 * rows[:, :3]).clamp(0, 1) * 1023).round().long()
-    r, g, b, alpha, *f0 = (rows[:, 3:].clamp(0, 1) * 65535).round().long().unbind(1)
+    normal = _codes(0.5 + 0.5 * rows[:, :3], 1023)
+    r, g, b, alpha = _codes(rows[:, 3:7], 65535)
     words = [
-        normal[:, 0] | normal[:, 1] << 10 | normal[:, 2] << 20 | 1 << 30,
-        r | g << 16, b | alpha << 16, f0[0] | f0[1] << 16, f0[2],
-    ]  # fmt: skip
+        _packed(normal) | 1 << 30,
+        r | g << 16,
+        b | alpha << 16,
+        _packed(_codes(rows[:, 7:].clamp(min=0).sqrt(), 1023)),
+    ]
     return torch.where(known[:, None], torch.stack(words, 1), 0).numpy().astype(np.uint32).view(np.int32)
 
 
-def same_everywhere(gdm: Gdm) -> tuple[bool, bool, Float[Tensor, "7"]]:
-    """Return whether all material has one albedo, whether it has one coat, and albedo, alpha and f0 of one voxel."""
-    rows = gdm.matter.reshape(-1, 10)[:, 3:].float()
-    rows = rows[rows[:, 3] > 0]
+def one_coat(gdm: Gdm) -> tuple[bool, Float[Tensor, "4"]]:
+    """Return whether all material has the same alpha and f0, and these of one voxel."""
+    rows = gdm.matter.reshape(-1, 10)[:, 6:].float()
+    rows = rows[rows[:, 0] > 0]
     if not len(rows):
-        return True, True, torch.zeros(7)
-    same = (rows.amax(0) - rows.amin(0)) < 1 / 65535
-    return bool(same[:3].all()), bool(same[3:].all()), rows[0].clamp(0, 1)
+        return True, torch.zeros(4)
+    return bool(((rows.amax(0) - rows.amin(0)) < 1 / 65535).all()), rows[0].clamp(0, 1)
+
+
+def _codes(values: Float[Tensor, "n channel"], most: int) -> tuple[Tensor, ...]:
+    return (values.clamp(0, 1) * most).round().long().unbind(1)
+
+
+def _packed(channels: tuple[Tensor, ...]) -> Tensor:
+    return channels[0] | channels[1] << 10 | channels[2] << 20
