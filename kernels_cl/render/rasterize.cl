@@ -24,12 +24,12 @@ static INNER void set_up_part(const int part, const int number, __global const V
     for (int v = VECTORS * part; v < MIN(VECTORS * (part + 1), padded >> 4); v++) {
         const int s = view->slots + 16 * v;
         const int lanes = (1 << MIN(16, count - 16 * v)) - 1;
-        int hidden = 0, beside = 0;
+        int hidden = 0, beside = 0, sunk = 0;
         for (int rest = lanes; rest; rest &= rest - 1) {
             const int lane = __builtin_ctz(rest);
             const int2 tag = tags[16 * v + lane];
             labels[s + lane].face = 16 * v + lane;
-            labels[s + lane].tag = tag.x;
+            labels[s + lane].tag = tag.x & ~SUNK;
             const int own = tag.y < 0 ? ~tag.y : tag.y;
             if (own != object) {
                 object = own;
@@ -37,10 +37,12 @@ static INNER void set_up_part(const int part, const int number, __global const V
                 near_bodies |= place & AROUND && objects[object].body;
             }
             beside |= (place & BESIDE && view->frustum) << lane;
+            sunk |= (tag.x & SUNK && view->sunk && !(place & AROUND)) << lane;
             hidden |= (tag.y < 0 || (view->cull && tag.x & CLOSED && !(place & AROUND))) << lane;
         }
         aside += __builtin_popcount(beside);
-        const int asked = lanes & ~beside;
+        turned += __builtin_popcount(sunk & ~beside);
+        const int asked = lanes & ~beside & ~sunk;
         if (!asked) {
             *(__global uchar16 *)(crossing + number * padded + 16 * v) = 0;
             for (int k = 0; k < 4; k++) {
@@ -100,7 +102,7 @@ static INNER void set_up_part(const int part, const int number, __global const V
 // Sets up 16 VECTORS faces for one view. `slots` triangles of a view stand together, cut ones behind the others.
 __kernel void set_up(__global const View *restrict views, __global const double *restrict vertices,  // (V, 3)
                      __global const int *restrict faces,   // (F, 3)
-                     __global const int2 *restrict tags,   // (F) component << 2 | CLOSED; object, ~ of it where a
+                     __global const int2 *restrict tags,   // (F) component << 2 | CLOSED | SUNK; object, ~ of it where a
                                                            // face is only there for rays that meet its front
                      __global Triangle *restrict triangles, __global Slot *restrict slots,
                      __global Label *restrict labels,
@@ -220,7 +222,7 @@ __kernel void cut_faces(__global const View *restrict views, __global const doub
             counted->drawn += __builtin_popcount(drawn);
             for (int l = 0; l < fits; l++) {
                 labels[s + l].face = f;
-                labels[s + l].tag = tags[f].x | (planes.front >> l & FRONT);
+                labels[s + l].tag = (tags[f].x & ~SUNK) | (planes.front >> l & FRONT);
                 for (int b = 0; b < 4; b++) box_of[b * stride + padded + n - pieces + l] = planes.box[b].lane[l];
             }
         }

@@ -14,7 +14,7 @@ from torchmeso.meso.bake_gdm import GdmOptions
 from torchmeso.render import frame
 from torchmeso.render.frame import FrameOptions, Skips
 from torchmeso.render.renderer import Renderer
-from torchmeso.render.scene import Material, Object, Scene, ShellOptions
+from torchmeso.render.scene import Material, Object, Scene, ShellOptions, assemble
 
 OPTIONS = FrameOptions(shadow_map_size=128, skips=Skips(carried=False))  # what torch does
 
@@ -188,3 +188,28 @@ def test_what_a_look_up_found_empty_is_not_asked_again(device):
     assert (torch.isfinite(on.depth) != seen).double().mean() < 2e-3
     moved = (on.depth - off.depth)[seen & torch.isfinite(on.depth)].abs()
     assert (moved > 2 * gdm.voxel).double().mean() < 1e-2
+
+
+@pytest.mark.parametrize("kind", ["around", "inside", "turned"])
+def test_bottoms_of_shells_around_bodies_are_left_out(weave, kind):
+    """From outside tops hide them, of a body turned inside out they do not, and from inside they are what is seen."""
+    scene = dressed(weave, "solid")
+    one, *rest = scene.objects
+    if kind == "turned":
+        one = replace(one, mesh=replace(one.mesh, faces=one.mesh.faces.flip(1)))
+        scene = replace(scene, objects=(one, *rest))
+    eye = camera((1.0, 0.0, 0.0), (1.0, 0.1, 1.0), size=64) if kind == "inside" else camera((1.5, 2.5, 2.0), size=64)
+    world = assemble(scene)
+    bottoms = (world.entry < 0) & torch.isin(world.owner, torch.tensor([0]))
+    assert bottoms.any()
+    assert world.sunk[bottoms].all() == (kind != "turned")
+    assert not world.sunk[~bottoms].any()
+    on, off = (
+        Renderer(scene, replace(OPTIONS, skips=Skips(carried=False, hidden=x))).render(eye) for x in (True, False)
+    )
+    assert torch.equal(on.rgb, off.rgb)
+    assert torch.equal(on.owner, off.owner)
+    if kind == "around":
+        assert on.counts["triangles drawn"] < 0.7 * off.counts["triangles drawn"]
+    if kind == "inside":
+        assert (on.owner == 0).double().mean() > 0.9

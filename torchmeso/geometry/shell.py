@@ -132,11 +132,16 @@ def build(mesh: Mesh, h: float, *, side: Side = "inward") -> Shell:
 
 
 def boundary(shell: Shell, *, base: Literal["solid", "open"] = "solid") -> Boundary:
-    """Return the faces through which rays come in: tops and borders, and bottoms where the base is open."""
+    """Return the faces through which rays come in: tops and borders, and bottoms where the base is open.
+
+    Kind by kind, so that what is left out of a view stands together.
+    """
     kinds = [TOP, BORDER] + [BOTTOM] * (base == "open")
     tet, corner = torch.isin(shell.neighbour, torch.tensor(kinds)).nonzero().unbind(1)
-    faces = shell.tets[tet].gather(1, OUTWARD[corner])
-    return Boundary(faces, tet, corner, shell.neighbour[tet, corner])
+    kind = shell.neighbour[tet, corner]
+    order = kind.argsort(stable=True, descending=True)
+    tet, corner = tet[order], corner[order]
+    return Boundary(shell.tets[tet].gather(1, OUTWARD[corner]), tet, corner, kind[order])
 
 
 def around(shell: Shell, point: Float[Tensor, "3"]) -> tuple[Int[Tensor, "k"], Float[Tensor, "k 3"]]:

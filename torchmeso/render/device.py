@@ -59,7 +59,7 @@ def upload_geometry(world: World) -> DeviceGeometry:
     dressed[[s.surface for s in world.shells]] = True  # shells are left through faces that nobody asks for
     number = world.object[world.owner]
     number = torch.where(dressed[world.owner], ~number, number)
-    tag = (world.component << 2) | (world.closed[world.component].long() << 1)
+    tag = (world.component << 2) | (world.closed[world.component].long() << 1) | world.sunk.long()
     return DeviceGeometry(
         upload_mesh(world.vertices, world.faces, torch.stack([tag, number], 1)),
         opencl.upload(vertex_records(world)),

@@ -27,7 +27,7 @@ TRIANGLE_BYTES, SLOT_BYTES, LABEL_BYTES, LIMIT = 96, 64, 8, 1 << 30
 
 VIEW = np.dtype(
     [("eye", "f8", 3), ("axes", "f8", (3, 3)), ("pixel_size", "f8"), ("near", "f8"), ("shift", "f8", 2)]
-    + [(name, "i4") for name in ("width", "height", "perspective", "slots", "stamps", "frustum", "cull", "pad")]
+    + [(name, "i4") for name in ("width", "height", "perspective", "slots", "stamps", "frustum", "cull", "sunk")]
 )
 """A camera as the kernels read it."""
 
@@ -55,7 +55,7 @@ class DeviceMesh(NamedTuple):
     Attributes:
         vertices: (V, 3) float64.
         faces: (F, 3) int32.
-        tags: (F, 2) int32: component << 2 | 2 where it is closed; object, or ~object where a face is only there for
+        tags: (F, 2) int32: component << 2 | 2 where it is closed | 1 where it is sunk (see `World`); object, or ~object where a face is only there for
             rays that meet its front.
         objects: (object,) see `BOX`.
         balls: (object, 4) centre and radius of a ball around each object.
@@ -183,7 +183,14 @@ class DeviceViews:
         }  # fmt: skip
 
     def aim(
-        self, cameras: Sequence[Camera], *, taken: int, frustum: bool = True, cull: bool = False, rest: bool = False
+        self,
+        cameras: Sequence[Camera],
+        *,
+        taken: int,
+        frustum: bool = True,
+        cull: bool = False,
+        sunk: bool = False,
+        rest: bool = False,
     ) -> bool:
         """Set the cameras and put the set-up of all triangles into the queue.
 
@@ -192,6 +199,7 @@ class DeviceViews:
             taken: layers that the tiles begin with.
             frustum: whether objects beside a view are left out.
             cull: whether faces of bodies that are turned away are left out, of bodies the eye is outside of.
+            sunk: whether faces that lie below others are left out, of bodies the eye is outside of.
             rest: whether triangles stay where they are when the cameras are those of the last time.
 
         Returns:
@@ -203,7 +211,7 @@ class DeviceViews:
             r["pixel_size"], r["near"], r["shift"] = camera.pixel_size, camera.near, camera.shift
             r["width"], r["height"] = camera.width, camera.height
             r["perspective"] = camera.projection == "perspective"
-            r["stamps"], r["frustum"], r["cull"] = stamps, frustum, cull
+            r["stamps"], r["frustum"], r["cull"], r["sunk"] = stamps, frustum, cull, sunk
             self.may_cut |= not _uncut(camera, self.mesh)
             stamps += -(-camera.width // 4) * -(-camera.height // 4)
         aimed = self._views.array.tobytes()

@@ -32,7 +32,7 @@ class Skips:
     Attributes:
         frustum: objects that lie beside the view are not set up.
         empty: what shows the background already, 4 x 4 pixels or texels of a map, is not written again.
-        hidden: triangles turned away are not drawn where no surface has depth.
+        hidden: triangles turned away are not drawn where no surface has depth, nor the bottoms of shells around bodies.
         behind: stretches that begin behind what a pixel already shows are not looked at.
         bounds: intervals too long to be passed through ask for no depth.
         plain: without any mesostructure no silhouette code runs.

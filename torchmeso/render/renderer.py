@@ -169,7 +169,12 @@ class Renderer:
             maps, picture = self._room(camera, lights)
             # The device sets the picture's triangles up while the lights' views are found.
             stays = picture.views.aim(
-                [camera], taken=self._taken, frustum=self._skips.frustum, cull=self._cull, rest=self._skips.resting
+                [camera],
+                taken=self._taken,
+                frustum=self._skips.frustum,
+                cull=self._cull,
+                sunk=self._skips.hidden,
+                rest=self._skips.resting,
             )
             drawn = maps is not None and self._draw_maps(maps, lights)
             self._draw_picture(picture, camera, lights, outputs)
@@ -266,7 +271,7 @@ class Renderer:
         size, corners = self.options.shadow_map_size, self._on_device.corners
         views = [v for light in lights for v in shadow_map.cameras(corners, light, size)]
         maps.lights = lights
-        maps.views.aim(views, taken=self._taken, frustum=self._skips.frustum)
+        maps.views.aim(views, taken=self._taken, frustum=self._skips.frustum, sunk=self._skips.hidden)
         for call in maps.draw:
             call()
         return True

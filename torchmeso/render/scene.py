@@ -238,6 +238,7 @@ class World(NamedTuple):
         object: (surface,) object each surface belongs to.
         origin: (3,) float64 where the vertices' origin lies in the world.
         entry: (F,) 4 tetrahedron + corner opposite, of faces that let rays into a shell; -1 of others.
+        sunk: (F,) whether a ray from outside of the body meets others before: bottoms of shells all around a body.
         shells: of all surfaces that have a GDM.
     """
 
@@ -254,6 +255,7 @@ class World(NamedTuple):
     object: Int[Tensor, "surface"]
     origin: Float[Tensor, "3"]
     entry: Int[Tensor, "F"]
+    sunk: Bool[Tensor, "F"]
     shells: tuple[PlacedShell, ...]
 
     def seen_by(self, camera: Camera) -> Camera:
@@ -307,7 +309,7 @@ def assemble(scene: Scene) -> World:
     vertices, origin = _at_home(torch.cat([m.vertices for m in meshes]), meshes[0].normals.dtype)
     corners = [(vertices, *(torch.cat([getattr(m, x) for m in meshes]) for x in ATTRIBUTES))]
     first_vertex, first_component, first_tet, next_vertex = 0, 0, 0, len(vertices)
-    faces, component, closed, owner, objects, entry, shells = [], [], [], [], [], [], []
+    faces, component, closed, owner, objects, entry, sunk, shells = [], [], [], [], [], [], [], []
     for i, o in enumerate(scene.objects):
         m = o.mesh
         part = torch.zeros(len(m.faces), dtype=torch.long) if o.part is None else o.part.long()
@@ -318,6 +320,7 @@ def assemble(scene: Scene) -> World:
         component.append(m.component[~dressed] + first_component)
         owner.append(part[~dressed] + len(objects))
         entry.append(torch.full((int((~dressed).sum()),), -1))
+        sunk.append(torch.zeros(len(entry[-1]), dtype=torch.bool))
         closed.append(still_closed)
         first_component += len(m.closed)
         moved = replace(m, vertices=vertices[first_vertex : first_vertex + len(m.vertices)])
@@ -334,6 +337,7 @@ def assemble(scene: Scene) -> World:
             component.append(torch.full_like(rim.tet, first_component))
             owner.append(torch.full_like(rim.tet, len(objects) + k))
             entry.append(torch.where(solid, -1, 4 * (rim.tet + first_tet) + rim.corner))
+            sunk.append(solid & _wrapped(m, which)[base.component[own.face[rim.tet // 3]]])
             closed.append(torch.tensor([False]))
             shells.append(PlacedShell(own, base, len(objects) + k, first_vertex, first_tet))
             first_component += 1
@@ -345,8 +349,20 @@ def assemble(scene: Scene) -> World:
         vertices=torch.cat([c[0] for c in corners]), faces=torch.cat(faces),
         **{name: torch.cat([c[k + 1] for c in corners]) for k, name in enumerate(ATTRIBUTES)},
         component=torch.cat(component), closed=torch.cat(closed), owner=torch.cat(owner),
-        object=torch.tensor(objects), origin=origin, entry=torch.cat(entry), shells=tuple(shells),
+        object=torch.tensor(objects), origin=origin, entry=torch.cat(entry), sunk=torch.cat(sunk),
+        shells=tuple(shells),
     )  # fmt: skip
+
+
+def _wrapped(mesh: Mesh, which: Bool[Tensor, "F"]) -> Bool[Tensor, "C"]:
+    """Return the components that are closed, right way out, and have all of their faces among `which`."""
+    p = mesh.vertices.double()[mesh.faces]
+    p = p - p.mean((0, 1))
+    volume = torch.zeros(len(mesh.closed), dtype=torch.float64)
+    volume.index_add_(0, mesh.component, (p[:, 0] * torch.linalg.cross(p[:, 1], p[:, 2])).sum(1))
+    whole = torch.ones(len(mesh.closed), dtype=torch.bool)
+    whole[mesh.component[~which]] = False
+    return mesh.closed & whole & (volume > 0)
 
 
 ATTRIBUTES = ("uv", "normals", "tangents", "sign", "scale")
