@@ -26,7 +26,7 @@ def at(gdm, codes, phi, row, z, y, x):
 
 
 def test_codes_are_those_of_the_table(weave):
-    codes = device_gdm.table_codes(weave)
+    codes = device_gdm.in_bricks(device_gdm.sample_codes(weave))
     assert len(codes) == device_gdm.table_bytes(weave)
     rng = np.random.default_rng(1)
     kinds = set()
@@ -60,6 +60,25 @@ def test_matter_keeps_its_values():
     np.testing.assert_allclose((roots / 1023) ** 2, rows[near, 7:], atol=5e-4)
     assert (words[near, 0] >> 30 == 1).all()
     assert not words[~near].any()
+
+
+def test_columns_that_repeat_are_kept_once(weave):
+    codes = device_gdm.sample_codes(weave).repeat(1, 3, 4, 1, 1)
+    packed = device_gdm.columns(codes)
+    assert packed is not None
+    rng = np.random.default_rng(2)
+    assert device_gdm.columns(device_gdm.sample_codes(weave)) is None or len(packed.codes) <= 600
+    _, height, width, rows, n_phi = codes.shape
+    assert (packed.index[..., -1] == packed.index[..., 0]).all()
+    for _ in range(300):
+        y, x, phi, row = (int(rng.integers(n)) for n in (height, width, n_phi, rows - 1))
+        got = packed.codes[packed.index[y, x, phi], row]
+        np.testing.assert_array_equal(got, codes[:, y, x, row : row + 2, phi].numpy())
+
+
+def test_columns_that_do_not_repeat_stay(rng):
+    codes = torch.randint(0, 254, (5, 10, 10, 6, 6), generator=rng).to(torch.uint8)
+    assert device_gdm.columns(codes) is None
 
 
 @pytest.mark.parametrize(("varied", "same"), [(3, True), (6, False), (9, False)])

@@ -12,6 +12,7 @@ from torchmeso.geometry.light import PointLight
 from torchmeso.meso import bake_gdm, generators
 from torchmeso.meso.bake_gdm import GdmOptions
 from torchmeso.render import frame
+from torchmeso.render.device_gdm import columns, sample_codes
 from torchmeso.render.frame import FrameOptions, Skips
 from torchmeso.render.renderer import Renderer
 from torchmeso.render.scene import Material, Object, Scene, ShellOptions, assemble
@@ -94,6 +95,12 @@ def dressed(weave, kind):
         matter[..., 6] *= torch.linspace(0.3, 1, matter.shape[2])
         matter[..., 7:] = 0.04 * matter[..., :1].abs()
         weave = replace(weave, matter=matter)
+    if kind == "columns":
+        parts = ("distance", "left", "occupancy", "matter")
+        weave = replace(
+            weave, **{x: getattr(weave, x).repeat(1, 4, 4, *[1] * (getattr(weave, x).dim() - 3)) for x in parts}
+        )
+        assert columns(sample_codes(weave)) is not None
     material = Material(gdm=weave, shell=shell, albedo=(0.4, 0.2, 0.2))
     one = Object(mesh=body, material=material)
     if kind == "parts":
@@ -105,7 +112,7 @@ def dressed(weave, kind):
     return Scene(objects=objects, lights=lights, ambient=0.1)
 
 
-@pytest.mark.parametrize("kind", ["solid", "open", "outward", "point", "parts", "below", "coat"])
+@pytest.mark.parametrize("kind", ["solid", "open", "outward", "point", "parts", "below", "coat", "columns"])
 def test_opencl_shows_what_torch_shows(weave, kind):
     scene = dressed(weave, kind)
     eye = camera((1.5, -2.5 if kind == "below" else 2.5, 2.0), size=48)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int32, UInt8
+from jaxtyping import Float, Int32, UInt8, UInt16
 from torch import Tensor
 
 from torchmeso.backends import opencl
@@ -17,7 +17,7 @@ from torchmeso.data.gdm import Gdm
 from torchmeso.geometry import sphere
 
 GDM = np.dtype(
-    [(name, "i4") for name in ("there", "layers", "height", "width", "n_theta", "n_phi", "table")]
+    [(name, "i4") for name in ("there", "layers", "height", "width", "n_theta", "n_phi", "table", "columns", "index")]
     + [(name, "i4") for name in ("per_phi", "per_row", "matter", "queries", "floor")]
     + [("h", "f4"), ("cap", "f4"), ("unit", "f4"), ("albedo", "f4", 3), ("bend", "f4")]
     + [("one_coat", "i4"), ("coat", "f4", 4)]
@@ -29,6 +29,9 @@ LEFT, SOLID = 255, 254
 
 BEND = 1.0
 """Voxels that a way through a shell may turn from a straight one, in frames, before its table is asked again."""
+
+MOST_COLUMNS = 65535
+"""As many as 16 bits can tell apart."""
 
 BLOCK, BRICK = 64, (2, 4, 4)
 """Bytes that tables are aligned to; layers, rows and columns of voxels that stand together."""
@@ -54,6 +57,22 @@ class Dressing(NamedTuple):
     bend: float = 0.0
 
 
+class Form(NamedTuple):
+    """Where a table stands and how it is packed.
+
+    Attributes:
+        table: block of the codes.
+        columns: how many different columns of voxels there are; 0: all of them stand in bricks.
+        index: block of where which column is.
+        matter: block of the material.
+    """
+
+    table: int
+    columns: int
+    index: int
+    matter: int
+
+
 class DeviceGdms(NamedTuple):
     """GDMs on the device.
 
@@ -61,11 +80,13 @@ class DeviceGdms(NamedTuple):
         tables: codes and materials of all.
         gdms: (surface,) see `GDM`.
         sources: whose tables they are, so that they can be kept.
+        forms: of each source.
     """
 
     tables: "opencl.Buffer"
     gdms: "opencl.Buffer"
     sources: tuple[Gdm, ...]
+    forms: tuple[Form, ...]
 
 
 def upload_gdms(dressings: Sequence[Dressing | None], before: DeviceGdms | None = None) -> DeviceGdms:
@@ -77,26 +98,13 @@ def upload_gdms(dressings: Sequence[Dressing | None], before: DeviceGdms | None 
         BackendError: there is no device, or no room on it.
     """
     sources = tuple({id(d.gdm): d.gdm for d in dressings if d is not None and d.gdm is not None}.values())
-    places, parts, blocks = {}, [], 0
     keep = (
         before is not None
         and len(before.sources) == len(sources)
         and all(a is b for a, b in zip(before.sources, sources, strict=True))
     )
-    for gdm in sources:
-        at = []
-        for size in (table_bytes(gdm), 16 * gdm.occupancy.numel()):
-            at.append(blocks)
-            blocks += -(-size // BLOCK)
-        places[id(gdm)] = at
-        if not keep:
-            parts += [table_codes(gdm), matter_codes(gdm)]
-    if keep and before is not None:
-        tables = before.tables
-    else:
-        tables = opencl.allocate(max(blocks, 1) * BLOCK)
-        for part, at in zip(parts, [x for gdm in sources for x in places[id(gdm)]], strict=True):
-            opencl.store(part, tables, at * BLOCK)
+    tables, forms = (before.tables, before.forms) if before is not None and keep else _upload_tables(sources)
+    form_of = dict(zip(map(id, sources), forms, strict=True))
     records = np.zeros(max(len(dressings), 1), GDM)
     for record, d in zip(records, dressings, strict=False):
         if d is None:
@@ -109,17 +117,47 @@ def upload_gdms(dressings: Sequence[Dressing | None], before: DeviceGdms | None 
         layers, height, width = d.gdm.voxels
         record["there"], record["layers"], record["height"], record["width"] = 1, layers, height, width
         record["n_theta"], record["n_phi"] = d.gdm.directions.n_theta, d.gdm.directions.n_phi
-        record["table"], record["matter"] = places[id(d.gdm)]
+        for name, value in form_of[id(d.gdm)]._asdict().items():
+            record[name] = value
         record["per_row"] = _voxels(d.gdm)
         record["per_phi"] = record["per_row"] * (d.gdm.directions.n_theta + 1)
         record["one_coat"], record["coat"] = one_coat(d.gdm)
         record["cap"], record["unit"] = d.gdm.cap, d.gdm.cap / 255
-    return DeviceGdms(tables, opencl.upload(records), sources)
+    return DeviceGdms(tables, opencl.upload(records), sources, forms)
+
+
+def _upload_tables(sources: Sequence[Gdm]) -> tuple["opencl.Buffer", tuple[Form, ...]]:
+    parts: list[np.ndarray] = []
+    starts = [0]
+
+    def place(part: np.ndarray) -> int:
+        parts.append(part)
+        starts.append(starts[-1] + -(-part.nbytes // BLOCK))
+        return starts[-2]
+
+    forms = []
+    for gdm in sources:
+        codes = sample_codes(gdm)
+        packed = columns(codes)
+        if packed is None:
+            forms.append(Form(place(in_bricks(codes)), 0, 0, place(matter_codes(gdm))))
+        else:
+            forms.append(Form(place(packed.codes), len(packed.codes), place(packed.index), place(matter_codes(gdm))))
+    tables = opencl.allocate(max(starts[-1], 1) * BLOCK)
+    for part, at in zip(parts, starts, strict=False):
+        opencl.store(part, tables, at * BLOCK)
+    return tables, tuple(forms)
 
 
 def table_bytes(gdm: Gdm) -> int:
-    """Return how many bytes `table_codes` takes."""
+    """Return how many bytes `in_bricks` takes."""
     return 4 * gdm.directions.n_phi * (gdm.directions.n_theta + 1) * _voxels(gdm)
+
+
+def held_bytes(gdm: Gdm) -> int:
+    """Return how many bytes kernels keep of a table: codes, and where which is; without the material."""
+    packed = columns(sample_codes(gdm))
+    return table_bytes(gdm) if packed is None else packed.codes.nbytes + packed.index.nbytes
 
 
 def _voxels(gdm: Gdm) -> int:
@@ -127,12 +165,8 @@ def _voxels(gdm: Gdm) -> int:
     return math.prod(-(-n // side) * side for n, side in zip(gdm.voxels, BRICK, strict=True))
 
 
-def table_codes(gdm: Gdm) -> UInt8[np.ndarray, "byte"]:
-    """Return a table as kernels read it, (phi, row, brick, voxel, 4): codes of distance, LEFT or SOLID.
-
-    Rows are the rings and a pole before and behind them; the four codes are of a row and the next, at an azimuth and
-    at the next one.
-    """
+def sample_codes(gdm: Gdm) -> UInt8[Tensor, "Z H W row phi"]:
+    """Return codes of distance, LEFT or SOLID; rows are the rings and a pole before and behind them."""
     distance, left = gdm.distance, gdm.left
     if distance.dtype != torch.uint8:
         distance = (distance.float() * (255 / gdm.cap)).round().clamp(0, 255).to(torch.uint8)
@@ -141,15 +175,59 @@ def table_codes(gdm: Gdm) -> UInt8[np.ndarray, "byte"]:
     total, known = sphere.with_poles(distance.float() * met), sphere.with_poles(met)
     codes = (total / known.clamp(min=1e-6)).round().clamp(0, SOLID - 1)
     codes = torch.where(known > 0.5, codes, LEFT)
-    codes = torch.where(solid[..., None, None], SOLID, codes).to(torch.uint8)
-    # Bricks of 4 x 4 x 2 voxels: a ray's eight lie in few lines of the cache.
-    short = [-n % side for n, side in zip(gdm.voxels, BRICK, strict=True)]
+    return torch.where(solid[..., None, None], SOLID, codes).to(torch.uint8)
+
+
+def in_bricks(codes: UInt8[Tensor, "Z H W row phi"]) -> UInt8[np.ndarray, "byte"]:
+    """Return a table as kernels read it, (phi, row, brick, voxel, 4): four codes at each voxel.
+
+    They are of a row of directions and the next, at an azimuth and at the next one. Bricks are of 4 x 4 x 2 voxels: a
+    ray's eight lie in few lines of the cache.
+    """
+    short = [-n % side for n, side in zip(codes.shape, BRICK, strict=False)]
     codes = torch.nn.functional.pad(codes, (0, 0, 0, 0, 0, short[2], 0, short[1], 0, short[0]))
     layers, height, width = codes.shape[:3]
     bricks = codes.reshape(layers // 2, 2, height // 4, 4, width // 4, 4, *codes.shape[3:])
     by_direction = bricks.permute(7, 6, 0, 2, 4, 1, 3, 5)
     pairs = torch.stack([by_direction[:, :-1], by_direction[:, 1:]], -1)
     return torch.cat([pairs, pairs.roll(-1, 0)], -1).flatten().numpy()
+
+
+class Columns(NamedTuple):
+    """A table whose columns of voxels repeat.
+
+    Attributes:
+        codes: (column, row, layer, 2) of each different one, at a row of directions and the next.
+        index: (H, W, phi + 1) which column stands there; behind the last azimuth the first again.
+    """
+
+    codes: UInt8[np.ndarray, "column row layer 2"]
+    index: UInt16[np.ndarray, "H W phi"]
+
+
+def columns(codes: UInt8[Tensor, "Z H W row phi"]) -> Columns | None:
+    """Return a table with equal columns, as seen at one azimuth, kept once; None where that is no eighth of it.
+
+    Threads, tiles and pebbles repeat, and what is solid at the bottom is the same everywhere. Nothing is lost.
+    """
+    layers, height, width, rows, n_phi = codes.shape
+    flat = codes.permute(1, 2, 4, 3, 0).reshape(height * width * n_phi, rows * layers).contiguous().numpy()
+    padded = np.pad(flat, ((0, 0), (0, -flat.shape[1] % 8))).view(np.uint64)
+    factors = np.random.default_rng(1).integers(1 << 63, size=padded.shape[1], dtype=np.uint64) | np.uint64(1)
+    keys = (padded * factors).sum(1)
+    _, first, which = np.unique(keys, return_index=True, return_inverse=True)
+    held = 2 * len(first) * (rows - 1) * layers + 2 * height * width * (n_phi + 1)
+    if len(first) > MOST_COLUMNS or 8 * held > 4 * (rows - 1) * flat.size // rows:
+        return None
+    if not all(np.array_equal(flat[part], flat[first[which[part]]]) for part in _parts(len(flat))):
+        return None  # two that differ have one key
+    each = flat[first].reshape(-1, rows, layers)
+    index = which.reshape(height, width, n_phi).astype(np.uint16)
+    return Columns(np.stack([each[:, :-1], each[:, 1:]], -1), np.concatenate([index, index[..., :1]], -1))
+
+
+def _parts(n: int) -> list[slice]:
+    return [slice(k, k + 8192) for k in range(0, n, 8192)]
 
 
 def matter_codes(gdm: Gdm) -> Int32[np.ndarray, "voxel 4"]:

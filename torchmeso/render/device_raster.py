@@ -55,8 +55,8 @@ class DeviceMesh(NamedTuple):
     Attributes:
         vertices: (V, 3) float64.
         faces: (F, 3) int32.
-        tags: (F, 2) int32: component << 2 | 2 where it is closed | 1 where it is sunk (see `World`); object, or ~object where a face is only there for
-            rays that meet its front.
+        tags: (F, 2) int32: component << 2 | 2 where it is closed | 1 where it is sunk (see `World`); object, or
+            ~object where a face is only there for rays that meet its front.
         objects: (object,) see `BOX`.
         balls: (object, 4) centre and radius of a ball around each object.
         ball: of one around all.
