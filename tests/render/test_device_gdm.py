@@ -69,10 +69,10 @@ def test_columns_that_repeat_are_kept_once(weave):
     rng = np.random.default_rng(2)
     assert device_gdm.columns(device_gdm.sample_codes(weave)) is None or len(packed.codes) <= 600
     _, height, width, rows, n_phi = codes.shape
-    assert (packed.index[..., -1] == packed.index[..., 0]).all()
+    assert (packed.which[..., -1] == packed.which[..., 0]).all()
     for _ in range(300):
         y, x, phi, row = (int(rng.integers(n)) for n in (height, width, n_phi, rows - 1))
-        got = packed.codes[packed.index[y, x, phi], row]
+        got = packed.codes[packed.which[y, x, phi], row]
         np.testing.assert_array_equal(got, codes[:, y, x, row : row + 2, phi].numpy())
 
 

@@ -17,7 +17,7 @@ from torchmeso.data.gdm import Gdm
 from torchmeso.geometry import sphere
 
 GDM = np.dtype(
-    [(name, "i4") for name in ("there", "layers", "height", "width", "n_theta", "n_phi", "table", "columns", "index")]
+    [(name, "i4") for name in ("there", "layers", "height", "width", "n_theta", "n_phi", "table", "columns", "which")]
     + [(name, "i4") for name in ("per_phi", "per_row", "matter", "queries", "floor")]
     + [("h", "f4"), ("cap", "f4"), ("unit", "f4"), ("albedo", "f4", 3), ("bend", "f4")]
     + [("one_coat", "i4"), ("coat", "f4", 4)]
@@ -63,13 +63,13 @@ class Form(NamedTuple):
     Attributes:
         table: block of the codes.
         columns: how many different columns of voxels there are; 0: all of them stand in bricks.
-        index: block of where which column is.
+        which: block of which column stands where.
         matter: block of the material.
     """
 
     table: int
     columns: int
-    index: int
+    which: int
     matter: int
 
 
@@ -142,7 +142,7 @@ def _upload_tables(sources: Sequence[Gdm]) -> tuple["opencl.Buffer", tuple[Form,
         if packed is None:
             forms.append(Form(place(in_bricks(codes)), 0, 0, place(matter_codes(gdm))))
         else:
-            forms.append(Form(place(packed.codes), len(packed.codes), place(packed.index), place(matter_codes(gdm))))
+            forms.append(Form(place(packed.codes), len(packed.codes), place(packed.which), place(matter_codes(gdm))))
     tables = opencl.allocate(max(starts[-1], 1) * BLOCK)
     for part, at in zip(parts, starts, strict=False):
         opencl.store(part, tables, at * BLOCK)
@@ -157,7 +157,7 @@ def table_bytes(gdm: Gdm) -> int:
 def held_bytes(gdm: Gdm) -> int:
     """Return how many bytes kernels keep of a table: codes, and where which is; without the material."""
     packed = columns(sample_codes(gdm))
-    return table_bytes(gdm) if packed is None else packed.codes.nbytes + packed.index.nbytes
+    return table_bytes(gdm) if packed is None else packed.codes.nbytes + packed.which.nbytes
 
 
 def _voxels(gdm: Gdm) -> int:
@@ -198,11 +198,11 @@ class Columns(NamedTuple):
 
     Attributes:
         codes: (column, row, layer, 2) of each different one, at a row of directions and the next.
-        index: (H, W, phi + 1) which column stands there; behind the last azimuth the first again.
+        which: (H, W, phi + 1) the column that stands there; behind the last azimuth the first again.
     """
 
     codes: UInt8[np.ndarray, "column row layer 2"]
-    index: UInt16[np.ndarray, "H W phi"]
+    which: UInt16[np.ndarray, "H W phi"]
 
 
 def columns(codes: UInt8[Tensor, "Z H W row phi"]) -> Columns | None:
@@ -215,15 +215,15 @@ def columns(codes: UInt8[Tensor, "Z H W row phi"]) -> Columns | None:
     padded = np.pad(flat, ((0, 0), (0, -flat.shape[1] % 8))).view(np.uint64)
     factors = np.random.default_rng(1).integers(1 << 63, size=padded.shape[1], dtype=np.uint64) | np.uint64(1)
     keys = (padded * factors).sum(1)
-    _, first, which = np.unique(keys, return_index=True, return_inverse=True)
+    _, first, own = np.unique(keys, return_index=True, return_inverse=True)
     held = 2 * len(first) * (rows - 1) * layers + 2 * height * width * (n_phi + 1)
     if len(first) > MOST_COLUMNS or 8 * held > 4 * (rows - 1) * flat.size // rows:
         return None
-    if not all(np.array_equal(flat[part], flat[first[which[part]]]) for part in _parts(len(flat))):
+    if not all(np.array_equal(flat[part], flat[first[own[part]]]) for part in _parts(len(flat))):
         return None  # two that differ have one key
     each = flat[first].reshape(-1, rows, layers)
-    index = which.reshape(height, width, n_phi).astype(np.uint16)
-    return Columns(np.stack([each[:, :-1], each[:, 1:]], -1), np.concatenate([index, index[..., :1]], -1))
+    which = own.reshape(height, width, n_phi).astype(np.uint16)
+    return Columns(np.stack([each[:, :-1], each[:, 1:]], -1), np.concatenate([which, which[..., :1]], -1))
 
 
 def _parts(n: int) -> list[slice]:
