@@ -550,3 +550,12 @@ def test_a_million_triangles_in_instances(brick, device):
     exact, fast = frame.render(in_double(scene), view, options), Renderer(scene, options).render(view)
     assert exact.counts["fragments"] == fast.counts["fragments"] > 1000
     assert ((exact.rgb - fast.rgb).abs().amax(-1) > 1 / 255).sum() <= 4
+
+
+def test_a_slanting_sun_leaves_out_what_it_cannot_shadow(device):
+    """Its box reaches nearer to the light than any body does: that alone does not put the light inside of one."""
+    scene = Scene(objects=(Object(mesh=shapes.sphere(triangles=2000), material=Material()),), lights=LIGHTS["sun"])
+    renderer = Renderer(scene, FrameOptions(shadow_map_size=256))
+    renderer.show(camera((2.0, 3.0, 1.5)))
+    stamps = renderer._maps.views.total("stamps")
+    assert renderer.counts["shadow stamps left out"] > 0.8 * stamps > 0

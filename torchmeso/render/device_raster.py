@@ -27,7 +27,10 @@ TRIANGLE_BYTES, SLOT_BYTES, LABEL_BYTES, LIMIT = 96, 64, 8, 1 << 30
 
 VIEW = np.dtype(
     [("eye", "f8", 3), ("axes", "f8", (3, 3)), ("pixel_size", "f8"), ("near", "f8"), ("shift", "f8", 2)]
-    + [(name, "i4") for name in ("width", "height", "perspective", "slots", "stamps", "frustum", "cull", "sunk")]
+    + [
+        (name, "i4")
+        for name in ("width", "height", "perspective", "slots", "stamps", "frustum", "cull", "sunk", "before", "pad")
+    ]
 )
 """A camera as the kernels read it."""
 
@@ -190,6 +193,7 @@ class DeviceViews:
         frustum: bool = True,
         cull: bool = False,
         sunk: bool = False,
+        before: bool = False,
         rest: bool = False,
     ) -> bool:
         """Set the cameras and put the set-up of all triangles into the queue.
@@ -200,6 +204,7 @@ class DeviceViews:
             frustum: whether objects beside a view are left out.
             cull: whether faces of bodies that are turned away are left out, of bodies the eye is outside of.
             sunk: whether faces that lie below others are left out, of bodies the eye is outside of.
+            before: whether orthographic views have all bodies ahead of them, as those of distant lights do.
             rest: whether triangles stay where they are when the cameras are those of the last time.
 
         Returns:
@@ -212,6 +217,7 @@ class DeviceViews:
             r["width"], r["height"] = camera.width, camera.height
             r["perspective"] = camera.projection == "perspective"
             r["stamps"], r["frustum"], r["cull"], r["sunk"] = stamps, frustum, cull, sunk
+            r["before"] = before and camera.projection == "orthographic"
             self.may_cut |= not _uncut(camera, self.mesh)
             stamps += -(-camera.width // 4) * -(-camera.height // 4)
         aimed = self._views.array.tobytes()

@@ -271,7 +271,7 @@ class Renderer:
         size, corners = self.options.shadow_map_size, self._on_device.corners
         views = [v for light in lights for v in shadow_map.cameras(corners, light, size)]
         maps.lights = lights
-        maps.views.aim(views, taken=self._taken, frustum=self._skips.frustum, sunk=self._skips.hidden)
+        maps.views.aim(views, taken=self._taken, frustum=self._skips.frustum, sunk=self._skips.hidden, before=True)
         for call in maps.draw:
             call()
         return True
