@@ -18,11 +18,12 @@ from torchmeso.backends import opencl
 from torchmeso.bench import vdm
 from torchmeso.bench.vdm import Vdm
 from torchmeso.data.gdm import Gdm
-from torchmeso.geometry import frames, hemisphere
+from torchmeso.geometry import frames
 from torchmeso.geometry.camera import Camera
 from torchmeso.geometry.directions import normalize
 from torchmeso.geometry.light import DirectionalLight
 from torchmeso.geometry.mesh import Mesh
+from torchmeso.render import device_tables
 from torchmeso.render.device_raster import DeviceRaster, upload_mesh
 from torchmeso.render.rasterize import barycentric, rasterize
 
@@ -88,8 +89,8 @@ class VdmFrames:
         ways, left = table.nodes
         cap = float(ways.max().clamp(min=1e-6))
         codes = torch.where(left > 0.5, LEFT, (ways * ((LEFT - 1) / cap)).round()).numpy().astype(np.uint16)
-        rings = hemisphere.rings(table.views)
-        ring = torch.stack([rings.theta, rings.size.double(), rings.phi0, rings.offset.double()], 1)
+        pairs = codes.astype(np.uint32) | np.roll(codes, -1, 0).astype(np.uint32) << 16
+        rings = device_tables.ring_records(table.views)
         lighting = np.zeros((3, 4), np.float32)
         lighting[0, :3], lighting[1, :3], lighting[2, 3] = light.direction.numpy(), light.irradiance.numpy(), ambient
         lighting[2, :3] = 0.6
@@ -97,10 +98,10 @@ class VdmFrames:
         self._view = opencl.Shared(np.zeros(12, np.float32))
         self._arguments = (
             opencl.upload(mesh.faces.int().numpy()), opencl.upload(per_vertex(mesh).float().numpy()),
-            opencl.upload(codes), opencl.upload(ring.float().numpy()),
+            opencl.upload(pairs), opencl.upload(rings),
             opencl.upload(gdm.matter.float().numpy()), self._view.buffer, opencl.upload(lighting),
             np.float32(cap / (LEFT - 1)), np.float32(table.most), np.float32(table.h), np.int32(ways.shape[0]),
-            np.int32(ways.shape[1]), np.int32(len(ring)), np.int32(ways.shape[2]), np.int32(ways.shape[3]),
+            np.int32(ways.shape[1]), np.int32(len(rings)), np.int32(ways.shape[2]), np.int32(ways.shape[3]),
             *(np.int32(n) for n in gdm.voxels), np.int32(camera.width), np.int32(camera.height), self._out,
         )  # fmt: skip
         self._lists: tuple[opencl.Buffer, ...] = ()
