@@ -20,7 +20,6 @@ from torchmeso.bench.gdm_error import NEAR, near_outline
 from torchmeso.bench.gdm_speed import SIZE, camera_entries, view
 from torchmeso.bench.suite import Context, Row
 from torchmeso.data import gdm_query
-from torchmeso.data.address import texel_centres
 from torchmeso.data.gdm_query import Query
 from torchmeso.geometry import shapes
 from torchmeso.geometry.rays import RayScene
@@ -74,10 +73,10 @@ class Unbaked:
         """The longest side of a voxel, tile units."""
         return gdm_query.voxel_side(self)
 
-    @cached_property
-    def solid(self) -> Float[Tensor, "voxel"]:
+    @property
+    def solid(self) -> "Solid":
         """1 where a voxel is inside of material."""
-        return self.caster.inside(self._places).float()
+        return Solid(self)
 
     def samples(
         self, voxel: Int[Tensor, "*batch 8"], node: Int[Tensor, "*batch 4"], dtype: torch.dtype
@@ -89,7 +88,7 @@ class Unbaked:
             at * self._ways.shape[0] + node.unsqueeze(-2).expand(shape).flatten(), return_inverse=True
         )
         at, w = which // self._ways.shape[0], self._ways[which % self._ways.shape[0]]
-        place, inside = self._places[at], self.solid[at] > 0.5
+        place, inside = self.places(at), self.solid[at] > 0.5
         t = torch.zeros(len(at))
         t[~inside], _ = self.caster.cast(place[~inside], w[~inside], inside[~inside])
         end = gdm_query.boundary(self, place, w)
@@ -103,18 +102,30 @@ class Unbaked:
         """Return how far it is from `place` along `w` to material; see `data.gdm.Gdm.evaluate`."""
         return gdm_query.query(self, place, w)
 
-    @cached_property
-    def _places(self) -> Float[Tensor, "voxel 3"]:
+    def places(self, voxel: Int[Tensor, "*batch"]) -> Float[Tensor, "*batch 3"]:
+        """Return where voxels are, by their numbers (layer * H + row) * W + column."""
         layers, height, width = self.voxels
-        z = -self.h + self.h * torch.arange(layers) / (layers - 1)
-        uv = texel_centres(height, width).reshape(-1, 2)
-        return torch.cat([uv.repeat(layers, 1), z.repeat_interleave(len(uv))[:, None]], 1)
+        u = (voxel % width + 0.5) / width
+        v = 1 - (voxel // width % height + 0.5) / height
+        return torch.stack([u, v, -self.h + self.h * (voxel // (width * height)) / (layers - 1)], -1)
 
     @cached_property
     def _ways(self) -> Float[Tensor, "node 3"]:
         """Directions of nodes, those of a row at each pole alike."""
         pole = torch.tensor([0.0, 0.0, 1.0]).expand(1, self.directions.n_phi, 3)
         return torch.cat([pole, self.directions.directions(), -pole]).reshape(-1, 3)
+
+
+@dataclass(frozen=True, eq=False)
+class Solid:
+    """Which voxels of a map are inside of material, found out when it is asked for."""
+
+    of: Unbaked
+
+    def __getitem__(self, voxel: Int[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        """Return 1 where voxels are inside of material."""
+        which, back = torch.unique(voxel.flatten(), return_inverse=True)
+        return self.of.caster.inside(self.of.places(which)).float()[back].reshape(voxel.shape)
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,7 +182,8 @@ def finest(context: Context) -> Iterator[Row]:
 
 
 def maps(caster: RayCastGdm, context: Context) -> Iterator[tuple[str, str, "Unbaked | Ray", int]]:
-    """Yield maps of one mesostructure, ever finer, with their names and look-ups per prism; the ray itself last."""
+    """Yield maps of one mesostructure, ever finer, with their names and look-ups per prism; the ray itself first."""
+    yield "ray", "a ray cast for every question", Ray(caster), 1
     sizes = ((64, 16), (128, 32)) if context.quick else SIZES
     for texels, n_theta in sizes:
         grid = SphereGrid(n_theta=n_theta, n_phi=2 * n_theta)
@@ -179,4 +191,3 @@ def maps(caster: RayCastGdm, context: Context) -> Iterator[tuple[str, str, "Unba
         size = f"{texels}x{texels}x{texels // 2}x{n_theta}x{2 * n_theta}"
         for queries in (1, 8):
             yield f"{texels}.{n_theta}.{queries}", f"{size}, {queries} look-ups per prism", map_, queries
-    yield "ray", "a ray cast for every question", Ray(caster), 1
