@@ -3,7 +3,16 @@
 Test: tests/bench/test_gdm.py
 """
 
-from torchmeso.bench import gdm_bake, gdm_error, gdm_identity, gdm_speed, gdm_tables
+from torchmeso.bench import (
+    gdm_bake,
+    gdm_distortion,
+    gdm_error,
+    gdm_finest,
+    gdm_identity,
+    gdm_speed,
+    gdm_tables,
+    gdm_vdm,
+)
 from torchmeso.bench.suite import Measurement
 
 MEASUREMENTS = [
@@ -17,8 +26,11 @@ MEASUREMENTS = [
     Measurement("distance", gdm_error.distance),
     Measurement("refined", gdm_error.refined),
     Measurement("silhouette", gdm_error.silhouette),
+    Measurement("finest", gdm_finest.finest),
     Measurement("tables", gdm_tables.tables),
-    Measurement("distortion", gdm_error.distortion),
+    Measurement("distortion", gdm_distortion.distortion),
+    Measurement("vdm", gdm_vdm.beside),
     Measurement("identity", gdm_identity.identity),
     Measurement("outline", gdm_identity.outlines),
+    Measurement("pace", gdm_identity.pace),
 ]

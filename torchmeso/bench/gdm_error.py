@@ -17,7 +17,6 @@ from torchmeso.data import gdm_query
 from torchmeso.data.gdm import Gdm
 from torchmeso.geometry import shapes
 from torchmeso.geometry.directions import normalize
-from torchmeso.geometry.mesh import Mesh, dress
 from torchmeso.geometry.rays import RayScene
 from torchmeso.meso import generators
 from torchmeso.meso.bake_gdm import GdmOptions, RayCastGdm
@@ -153,37 +152,3 @@ def near_outline(mask: Bool[Tensor, "H W"]) -> Bool[Tensor, "H W"]:
     most = torch.nn.functional.max_pool2d(whole, side, 1, NEAR)
     least = -torch.nn.functional.max_pool2d(-whole, side, 1, NEAR)
     return (most != least)[0, 0]
-
-
-def distortion(context: Context) -> Iterator[Row]:
-    """Base meshes ever finer: how far rays end from where they do on the finest, laid over it as triangles."""
-    bodies = {
-        "flat": lambda n: shapes.plane(triangles=n),
-        "cylinder": lambda n: shapes.cylinder(radius=0.7, height=1.6, tiles=(6, 2), triangles=n),
-        "saddle": saddle,
-        "sphere": lambda n: shapes.sphere(triangles=n, tiles=(6, 3)),
-        "torus": lambda n: shapes.torus(triangles=n, tiles=(5, 2)),
-    }
-    for name, body in bodies.items():
-        for factor in (1, 4) if context.quick else (1, 4, 16):
-            mesh = body(500 * factor)
-            gdm = table("weave", GdmOptions(texels=64, layers=32), context, backing=True)
-            twin = displace(body(16 * 500), generators.weave(backing=True), max_edge=0.05)
-            built, entries, _ = camera_entries(mesh, gdm.h, view())
-            hits = RayScene(twin.vertices, twin.faces).first_hit(entries.origin.float(), entries.direction.float())
-            found = DeviceTrace(built, mesh, gdm, bend=device_gdm.BEND * gdm.voxel).trace(entries)
-            both = found.hit & (hits.face >= 0)
-            off = (found.t - hits.t.double()).abs()[both] / float(mesh.scale.mean())
-            yield Row(
-                id=f"distortion.{name}.{factor}", unit="tile units", better="lower", n=len(off),
-                what=f"{name} of {len(mesh.faces)} triangles: median error of where rays end, beside the finest",
-                value=round(float(off.median()), 5), curve={"series": name, "x": factor, "y": "median"},
-            )  # fmt: skip
-
-
-def saddle(triangles: int) -> Mesh:
-    """Return a sheet that bends up along x and down along z, by radii of 1."""
-    sheet = shapes.plane(triangles=triangles)
-    vertices = sheet.vertices.clone()
-    vertices[:, 1] = 0.5 * (vertices[:, 0].square() - vertices[:, 2].square())
-    return dress(vertices, sheet.faces, sheet.uv)

@@ -69,6 +69,11 @@ def refusals() -> Iterator[Refusal]:
         "one_direction": {"distance": weave.distance[..., :1, :1], "left": weave.left[..., :1, :1]},
         "occupancy_nan": {"occupancy": weave.occupancy * math.nan},
         "occupancy_2": {"occupancy": weave.occupancy + 2},
+        "matter_nan": {"matter": weave.matter * math.nan},
+        "matter_inf": {"matter": weave.matter + math.inf},
+        "distance_nan": {"distance": weave.distance.float() * math.nan},
+        "distance_negative": {"distance": weave.distance.float() - 1},
+        "distance_beyond_cap": {"distance": weave.distance.float() + 2 * weave.cap},
     }  # fmt: skip
     for name, parts in shapes_of.items():
         yield Refusal(

@@ -7,6 +7,7 @@ Test: tests/bench/test_gdm_identity.py
 """
 
 from collections.abc import Iterator
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -14,9 +15,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchmeso import quality
+from torchmeso.bench.frames import SMALL
 from torchmeso.bench.gdm_error import NEAR, near_outline
-from torchmeso.bench.gdm_speed import scene_of, table, view
+from torchmeso.bench.gdm_speed import drawn, scene_of, table, view
+from torchmeso.bench.speed import MAP
 from torchmeso.bench.suite import Context, Row
+from torchmeso.bench.timing import time_together
+from torchmeso.config import MaterialConfig
 from torchmeso.data.gdm import Gdm
 from torchmeso.data.mdf import Mdf
 from torchmeso.geometry import shapes
@@ -28,9 +33,13 @@ from torchmeso.meso import bake_mdf, generators
 from torchmeso.meso.bake_gdm import GdmOptions
 from torchmeso.meso.bake_mdf import MdfOptions
 from torchmeso.meso.displace import displace
-from torchmeso.render.frame import FrameOptions
+from torchmeso.pipeline import bake
+from torchmeso.render.frame import FrameOptions, Skips
 from torchmeso.render.renderer import Renderer
 from torchmeso.render.scene import Material, ShellOptions
+from torchmeso.render.silhouette import Silhouette
+
+SILHOUETTES: tuple[Silhouette, ...] = ("paper", "curved")
 
 MESOS = ("weave", "chain", "squama", "pipes")
 
@@ -124,6 +133,40 @@ def outlines(context: Context) -> Iterator[Row]:
             id=f"outline.{name}.distance", what=f"{of}: mean distance of the outline from the true one", unit="px",
             value=round(quality.boundary_distance(mask, right), 3), better="lower",
         )  # fmt: skip
+
+
+def pace(context: Context) -> Iterator[Row]:
+    """Frames of the same weave in a shell, and as BTF and MDF: without and with shadows, the same mesh and view."""
+    mesh, camera = shapes.torus(triangles=12000, tiles=(5, 2)), view()
+    gdm = table("weave", GdmOptions(texels=64, layers=32), context, backing=True)
+    wanted = MaterialConfig.model_validate({"meso": {"type": "weave", "backing": True}, **SMALL})
+    flat = bake.prepare_material("weave", wanted, context.report).material
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        calls = {}
+        for shadows in (False, True):
+            calls[f"gdm.{shadows}"] = drawn(scene_of(mesh, Material(gdm=gdm)), shadows=shadows)
+            for name in SILHOUETTES:
+                options = FrameOptions(
+                    silhouette=name, shadows=shadows, shadow_map_size=MAP, skips=Skips(resting=False)
+                )  # fmt: skip
+                calls[f"{name}.{shadows}"] = Renderer(scene_of(mesh, flat), options)
+        timing = time_together(
+            {name: partial(r.show, camera) for name, r in calls.items()}, n=9 if context.quick else 25, warm=3,
+            settle=2,
+        )  # fmt: skip
+    finally:
+        torch.set_num_threads(threads)
+    for name in SILHOUETTES:
+        for shadows, word in ((False, "without shadows"), (True, "with shadows")):
+            ours, theirs = timing[f"gdm.{shadows}"], timing[f"{name}.{shadows}"]
+            yield Row(
+                id=f"pace.{name}{'.shadow' * shadows}", unit="x", better="lower", n=ours.n,
+                what=f"weave on 12,000 triangles, {word}: BTF and MDF with the {name} test, times as fast as the GDM",
+                value=round(ours.wall / theirs.wall, 2),
+                peer=f"BTF and MDF {theirs.wall:.1f} ms, GDM {ours.wall:.1f} ms",
+            )  # fmt: skip
 
 
 def masks(mesh: Mesh, camera: Camera, gdm: Gdm, depth: Mdf) -> dict[str, Bool[Tensor, "H W"]]:

@@ -26,6 +26,9 @@ from torchmeso.errors import ShapeError, check_finite, check_range, check_shape
 from torchmeso.geometry import sphere
 from torchmeso.geometry.sphere import SphereGrid
 
+ROUNDED = 1e-3
+"""Halves of the longest distance may lie above it by this share."""
+
 
 class Matter(NamedTuple):
     """What material is made of near points.
@@ -65,7 +68,7 @@ class Gdm:
     cap: float
 
     def __post_init__(self) -> None:
-        """Raise ShapeError or ConfigError unless the parts match."""
+        """Raise ShapeError or ConfigError unless the parts match, are finite and lie in their ranges."""
         check_shape("gdm.distance", self.distance, (-1, -1, -1, -1, -1))
         shape = tuple(self.distance.shape)
         if self.distance.dtype not in (torch.uint8, torch.float16, torch.float32, torch.float64):
@@ -76,8 +79,11 @@ class Gdm:
         if shape[0] < 2 or min(shape[1:3]) < 1:
             raise ShapeError(f"gdm.distance: expected at least two layers of one voxel, got {shape[:3]}")
         check_finite("gdm.occupancy", self.occupancy, 0, 1)
+        check_finite("gdm.matter", self.matter)
         check_range("gdm.h", self.h, 1e-6, 1e3)
         check_range("gdm.cap", self.cap, 1e-6, 1e3)
+        if self.distance.is_floating_point():
+            check_finite("gdm.distance", self.distance, 0, self.cap * (1 + ROUNDED))
         SphereGrid(n_theta=shape[3], n_phi=shape[4])
 
     @property

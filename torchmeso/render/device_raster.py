@@ -287,6 +287,11 @@ class DeviceRaster:
             self._cut_room = max(self._cut_room, count["slots"])
             self._make()
 
+    @property
+    def buffers(self) -> "tuple[opencl.Buffer, ...]":
+        """First layer and number of layers of each stamp; key and slot of the layers; labels of the slots."""
+        return self._begin, self._layers, self._key, self._slot, self.views.labels
+
     def lists(self, camera: Camera) -> DeviceLists:
         """Draw, and return the fragments."""
         self.draw(camera)

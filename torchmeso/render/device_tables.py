@@ -241,8 +241,8 @@ def _reflectance(pool: "_Pool", btf: EigenBtf, *, ambient: bool) -> np.ndarray:
     by_channel[:, :, 3] = _bounds(btf, weights)
     record["there"], record["height"], record["width"], record["groups"] = EIGEN, height, width, groups
     record["codes"] = codes
-    record["light_rings"], record["light_count"] = pool.add(_rings(btf.lights)), _ring_count(btf.lights)
-    record["view_rings"], record["view_count"] = pool.add(_rings(views)), _ring_count(views)
+    record["light_rings"], record["light_count"] = pool.add(ring_records(btf.lights)), _ring_count(btf.lights)
+    record["view_rings"], record["view_count"] = pool.add(ring_records(views)), _ring_count(views)
     record["maps"] = pool.add(_grouped(torch.cat(maps)).numpy())
     record["levels"], record["level_count"] = pool.add(_level_records(btf, [len(x) for x in maps])), len(maps)
     record["weights"], record["scale"], record["offset"] = (pool.add(x.numpy()) for x in (by_channel, scale, offset))
@@ -402,7 +402,7 @@ def _mdf(pool: "_Pool", mdf: Mdf) -> np.ndarray:
     paired = torch.stack([delta, delta[_next_in_ring(mdf.directions)]], -1)
     relief = mdf.relief
     record["there"], record["height"], record["width"] = 1, *mdf.texels
-    record["rings"], record["ring_count"] = pool.add(_rings(mdf.directions)), _ring_count(mdf.directions)
+    record["rings"], record["ring_count"] = pool.add(ring_records(mdf.directions)), _ring_count(mdf.directions)
     record["delta"] = pool.add(paired.numpy())
     missing = None if mdf.no_hit is None else hemisphere.with_pole(mdf.no_hit.float(), mdf.directions)
     record["missing"] = -1 if missing is None else pool.add(missing.numpy())
@@ -424,7 +424,7 @@ def _plateaus(codes: UInt16[np.ndarray, "H4 W4"], top: Bool[np.ndarray, "H W"]) 
     return flat.astype(np.uint8)
 
 
-def _rings(directions: DirectionSet) -> Float[np.ndarray, "ring 8"]:
+def ring_records(directions: DirectionSet) -> Float[np.ndarray, "ring 8"]:
     """Return theta, size, phi0, first node, and whether all rings but the pole are alike."""
     rings = hemisphere.rings(directions)
     table = np.zeros((len(rings.theta), 8), np.float32)
