@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchmeso.bench import frames, speed
+from torchmeso.bench import frames, graphcut, speed
 from torchmeso.bench.suite import Context, Measurement, Row
 from torchmeso.bench.timing import time_together
 from torchmeso.config import MaterialConfig, data_dir
@@ -226,6 +226,7 @@ MEASUREMENTS = [
     Measurement("synthesize.quilting", times),
     Measurement("synthesize.search", search),
     Measurement("synthesize.seam_dp", seams_by_dp),
+    Measurement("cut", graphcut.cuts),
     Measurement("synthesize.seams", seam_energy),
     Measurement("synthesize.frame", frame_cost),
 ]
