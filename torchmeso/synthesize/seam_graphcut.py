@@ -19,7 +19,7 @@ boykov2004experimental's two trees. In torch SciPy's maximum flow takes the plac
 Kernel: kernels_cl/synthesize/seam_graphcut.cl          Test: tests/synthesize/test_seam_graphcut.py
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 import torch
@@ -117,7 +117,7 @@ def gaps(side: Int[Tensor, "H W"]) -> tuple[int, int] | None:
     if len(changes) != 2:
         return None
     for kind in (OLD, NEW):
-        pieces, count = ndimage.label(held == kind)
+        pieces, count = cast(tuple[np.ndarray, int], ndimage.label(held == kind))
         edge = np.concatenate([pieces[0], pieces[-1], pieces[:, 0], pieces[:, -1]])
         if len(np.unique(edge[edge > 0])) < count:
             return None
