@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchmeso.bench import frames, graphcut, speed
+from torchmeso.bench import frames, graphcut, speed, wang
 from torchmeso.bench.suite import Context, Measurement, Row
 from torchmeso.bench.timing import time_together
 from torchmeso.config import MaterialConfig, data_dir
@@ -227,6 +227,8 @@ MEASUREMENTS = [
     Measurement("synthesize.search", search),
     Measurement("synthesize.seam_dp", seams_by_dp),
     Measurement("cut", graphcut.cuts),
+    Measurement("tiles.time", wang.times),
+    Measurement("tiles.looks", wang.looks),
     Measurement("synthesize.seams", seam_energy),
     Measurement("synthesize.frame", frame_cost),
 ]
