@@ -14,116 +14,136 @@
 static int apart(const int d, const int stride) { return d == 0 ? -1 : d == 1 ? 1 : d == 2 ? -stride : stride; }
 
 // ---- Shortest paths in the dual: texels' corners, joined along the texels' sides ----
+//
+// The corner at the lower right of a texel has its number. Corners wait in buckets by distance, a ring of them, each
+// corner in one at most; within a bucket the order is of no account: whatever gets nearer waits again.
 
-#define CORNER_BITS 20
+#define BUCKETS 256
 
-// The least of a heap of cost << CORNER_BITS | corner, four below each.
-static ulong heap_pop(__global ulong *restrict heap, int *count)
+typedef struct {
+    __global long *d;                        // (texels) distance
+    __global int *next, *previous, *bucket;  // (texels) -1 = none
+    int first[BUCKETS];
+    int shift, waiting;
+    long now;                                // number of the bucket at hand, not taken modulo
+} Queue;
+
+static void put_in(Queue *q, const int at, long bucket)
 {
-    const ulong first = heap[0], last = heap[--*count];
-    int at = 0;
-    for (;;) {
-        const int below = 4 * at + 1;
-        if (below >= *count) break;
-        int least = below;
-        const int end = below + 4 < *count ? below + 4 : *count;
-        for (int k = below + 1; k < end; k++) least = heap[k] < heap[least] ? k : least;
-        if (heap[least] >= last) break;
-        heap[at] = heap[least];
-        at = least;
-    }
-    heap[at] = last;
-    return first;
+    if (bucket >= q->now + BUCKETS) bucket = q->now + BUCKETS - 1;  // looked at again from there
+    const int b = (int)bucket & (BUCKETS - 1), first = q->first[b];
+    q->bucket[at] = b;
+    q->next[at] = first;
+    q->previous[at] = -1;
+    if (first >= 0) q->previous[first] = at;
+    q->first[b] = at;
+    q->waiting++;
 }
 
-static void heap_push(__global ulong *restrict heap, int *count, const ulong key)
+static void take_out(Queue *q, const int at)
 {
-    int at = (*count)++;
-    while (at > 0) {
-        const int above = (at - 1) >> 2;
-        if (heap[above] <= key) break;
-        heap[at] = heap[above];
-        at = above;
-    }
-    heap[at] = key;
+    const int before = q->previous[at], behind = q->next[at];
+    if (before >= 0) q->next[before] = behind;
+    else q->first[q->bucket[at]] = behind;
+    if (behind >= 0) q->previous[behind] = before;
+    q->bucket[at] = -1;
+    q->waiting--;
 }
 
-// The cost of passing between two neighbours; -1 = they are held together.
-static long between(const int p, const int q, __global const uchar *restrict side, __global const int *restrict e)
+static void reach(Queue *q, const int to, const long distance)
+{
+    if (distance >= q->d[to]) return;
+    q->d[to] = distance;
+    const long bucket = distance >> q->shift;
+    if (q->bucket[to] >= 0) {
+        if (((int)bucket & (BUCKETS - 1)) == q->bucket[to]) return;
+        take_out(q, to);
+    }
+    put_in(q, to, bucket);
+}
+
+// What it costs to pass between two neighbours; -1 = they are held together, or one stands outside of the overlap's
+// border and the other is held: terminals reach around it.
+static int between(const int p, const int q, __global const uchar *restrict side, __global const int *restrict e,
+                   const int border)
 {
     const int a = side[p], b = side[q];
-    if (a == ABSENT || b == ABSENT) return 0;
-    if (a == b && a != FREE) return -1;
-    return (long)e[p] + e[q];
+    if (a == ABSENT || b == ABSENT) return border && (a == OLD || b == OLD || a == NEW || b == NEW) ? -1 : 0;
+    return a == b && a != FREE ? -1 : e[p] + e[q];
 }
 
-// Corner (y, x) of the (rows + 1) x (columns + 1) corners is the upper left one of texel (y + 1, x + 1) of the grid.
-__kernel void planar(const int rows, const int columns, const int start, const int end,
+// Costs of the steps to the right and down from each corner; none leaves the overlap.
+static void steps(const int rows, const int columns, __global const uchar *restrict side,
+                  __global const int *restrict e, __global int *restrict right, __global int *restrict down)
+{
+    const int stride = columns + 2;
+    for (int y = 0; y < rows + 2; y++)
+        for (int x = 0; x < stride; x++) {
+            const int p = y * stride + x;
+            const int inside = y <= rows && x <= columns;
+            right[p] = inside && x < columns ? between(p + 1, p + 1 + stride, side, e, y == 0 || y == rows) : -1;
+            down[p] = inside && y < rows ? between(p + stride, p + 1 + stride, side, e, x == 0 || x == columns) : -1;
+        }
+}
+
+__kernel void planar(const int rows, const int columns, const int start, const int end, const int shift,
                      __global const uchar *restrict side,  // (rows + 2, columns + 2)
                      __global const int *restrict cost,    // (B, rows + 2, columns + 2) e
-                     __global long *restrict far,          // (B, rows + 1, columns + 1) scratch
-                     __global ulong *restrict heaps,       // (B, 4 * (rows + 1) * (columns + 1)) scratch
+                     __global long *restrict far,          // (B, rows + 2, columns + 2) scratch
+                     __global int *restrict scratch,       // (B, 5, rows + 2, columns + 2)
                      __global uchar *restrict old,         // (B, rows + 2, columns + 2)
                      __global long *restrict value)        // (B)
 {
-    const int b = get_global_id(0), across = columns + 1, corners = (rows + 1) * across;
-    const int stride = columns + 2, texels = (rows + 2) * stride;
-    __global const int *e = cost + (size_t)b * texels;
-    __global long *d = far + (size_t)b * corners;
-    __global ulong *heap = heaps + (size_t)b * 4 * corners;
-    old += (size_t)b * texels;
-    for (int k = 0; k < corners; k++) d[k] = FAR;
-    int count = 0;
-    d[start] = 0;
-    heap_push(heap, &count, (ulong)start);
-    while (count) {
-        const ulong least = heap_pop(heap, &count);
-        const int at = (int)(least & ((1 << CORNER_BITS) - 1));
-        const long here = (long)(least >> CORNER_BITS);
-        if (here > d[at]) continue;
-        if (at == end) break;
-        const int y = at / across, x = at - y * across;
-        const int p = y * stride + x;  // the texel up and left of the corner
-        for (int way = 0; way < 4; way++) {
-            if (way == 0 ? x == 0 : way == 1 ? x == columns : way == 2 ? y == 0 : y == rows) continue;
-            const int one = way == 0 ? p : way == 1 ? p + 1 : way == 2 ? p : p + stride;
-            const int other = way < 2 ? one + stride : one + 1;
-            // On the outer border one walks free, but not along a terminal: from there it reaches outwards.
-            const int held = way < 2 ? (y == 0 ? side[other] : y == rows ? side[one] : FREE)
-                                     : (x == 0 ? side[other] : x == columns ? side[one] : FREE);
-            if (held == OLD || held == NEW) continue;
-            const long step = between(one, other, side, e);
-            if (step < 0) continue;
-            const int to = at + apart(way, across);
-            if (here + step < d[to]) {
-                d[to] = here + step;
-                heap_push(heap, &count, (ulong)(here + step) << CORNER_BITS | (ulong)to);
-            }
+    const int b = get_global_id(0), stride = columns + 2, n = (rows + 2) * stride;
+    __global const int *e = cost + (size_t)b * n;
+    __global int *right = scratch + (size_t)b * 5 * n, *down = right + n;
+    __global long *d = far + (size_t)b * n;
+    old += (size_t)b * n;
+    Queue q = {d, right + 2 * n, right + 3 * n, right + 4 * n, {0}, shift, 0, 0};
+    for (int k = 0; k < BUCKETS; k++) q.first[k] = -1;
+    for (int p = 0; p < n; p++) {
+        d[p] = FAR;
+        q.bucket[p] = -1;
+    }
+    steps(rows, columns, side, e, right, down);
+    reach(&q, start, 0);
+    while (q.waiting) {
+        const int at = q.first[(int)q.now & (BUCKETS - 1)];
+        if (at < 0) {
+            q.now++;
+            if (d[end] >> shift < q.now) break;  // nothing that waits is nearer
+            continue;
         }
+        take_out(&q, at);
+        const long here = d[at];
+        if (here >> shift > q.now) {
+            put_in(&q, at, here >> shift);
+            continue;
+        }
+        if (right[at] >= 0) reach(&q, at + 1, here + right[at]);
+        if (down[at] >= 0) reach(&q, at + stride, here + down[at]);
+        if (at >= 1 && right[at - 1] >= 0) reach(&q, at - 1, here + right[at - 1]);
+        if (at >= stride && down[at - stride] >= 0) reach(&q, at - stride, here + down[at - stride]);
     }
     const long D = d[end];
     value[b] = D;
     // Differences of distances, none above D, are a flow. What has capacity left from the old ones is old too.
-    __global int *todo = (__global int *)heap;
+    for (int p = 0; p < n; p++) d[p] = min(d[p], D);
+    __global int *todo = q.next;
     int last = 0;
-    for (int p = 0; p < texels; p++) {
+    for (int p = 0; p < n; p++) {
         old[p] = side[p] == OLD;
         if (old[p]) todo[last++] = p;
     }
     for (int next = 0; next < last; next++) {
-        const int p = todo[next], y = p / stride - 1, x = p % stride - 1;
+        const int p = todo[next], up = p - stride - 1;
+        // The flow to each neighbour: the distance on the right, as one goes, less that on the left.
+        const long flow[4] = {d[up] - d[up + stride], d[p] - d[up + 1], d[up + 1] - d[up], d[up + stride] - d[p]};
         for (int way = 0; way < 4; way++) {
-            const int q = p + apart(way, stride);
-            if (old[q] || side[q] == ABSENT || side[q] == NEW) continue;
-            // The corners to the left and to the right of the way, as one goes.
-            const int up = y * across + x;
-            const int left = way == 0 ? up + across : way == 1 ? up + 1 : way == 2 ? up : up + across + 1;
-            const int right = way == 0 ? up : way == 1 ? up + across + 1 : way == 2 ? up + 1 : up + across;
-            const long flow = min(d[right], D) - min(d[left], D);
-            if ((long)e[p] + e[q] > flow) {
-                old[q] = 1;
-                todo[last++] = q;
-            }
+            const int to = p + apart(way, stride);
+            if (old[to] || side[to] == ABSENT || side[to] == NEW || e[p] + e[to] <= flow[way]) continue;
+            old[to] = 1;
+            todo[last++] = to;
         }
     }
 }

@@ -94,9 +94,9 @@ def times(context: Context) -> Iterator[Row]:
     )  # fmt: skip
 
 
-def grown(look: Look, kind: Kind) -> TileSet:
+def grown(look: Look, kind: Kind, *, toroidal: bool = False) -> TileSet:
     """Return tiles of 64 x 64 texels."""
-    options = WangOptions(size=SIDE, kind=kind)
+    options = WangOptions(size=SIDE, kind=kind, toroidal=toroidal)
     rng = torch.Generator().manual_seed(0)
     return wang.grow(patch_error.exemplar(look), options, rng=rng, backend="auto").set
 

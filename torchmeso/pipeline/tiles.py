@@ -132,7 +132,7 @@ def lay(
     tiles = tile_set.load(path)
     found = tiles.lay(_cells(tiles, size, hashed, seed), tileable=hashed)
     if exemplar is None:
-        about = {"seed": seed, "tiles": f"{size[1]} x {size[0]}", "made from": Path(path).name}
+        about = {"seed": seed, "plane": f"{size[1]} x {size[0]} tiles", "made from": Path(path).name}
         quilting_map.save(found, out, **about)
         return found
     shown = open_look(exemplar)[1]()

@@ -12,7 +12,7 @@ Costs are whole numbers, and of all cuts of least cost the one is taken that kee
 the same whatever way it is found, so both backends and any number of threads give the same cut.
 
 Where both sides reach the border of the patch, each in one piece, and no old seam counts, the cut is a shortest path
-along the sides of texels from one gap between them to the other: Dijkstra's. Clipped at that distance, distances are a
+along the sides of texels from one gap between them to the other. Clipped at that distance, distances are a
 flow of the same value, and what has capacity left from the old side is the least set. Else it is found by
 boykov2004experimental's two trees. In torch SciPy's maximum flow takes the place of both.
 
@@ -175,9 +175,12 @@ def _cut_opencl(e: Tensor, side: Tensor, errors: Tensor) -> Cut:
     value = opencl.aligned(torch.empty(batch, dtype=torch.int64))
     sizes, ends = [np.int32(height), np.int32(width)], None if bool(errors.any()) else gaps(side)
     if ends is not None:
-        corners = (height + 1) * (width + 1)
-        parts = [held, cost, *(torch.empty(batch, n * corners, dtype=torch.int64) for n in (1, 4)), old, value]
-        name, sizes = "planar", [*sizes, *(np.int32(k) for k in ends)]
+        # Corners have the number of the texel up and left of them in the bordered grid; buckets are half a step wide.
+        sizes += [np.int32(k // (width + 1) * (width + 2) + k % (width + 1)) for k in ends]
+        sizes.append(np.int32(max(int(e.double().mean()).bit_length() - 1, 0)))
+        scratch = [torch.empty(batch, texels, dtype=torch.int64), torch.empty(batch, 5 * texels, dtype=torch.int32)]
+        parts = [held, cost, *scratch, old, value]
+        name = "planar"
     else:
         scratch = [
             torch.empty(batch, n * texels, dtype=kind)
