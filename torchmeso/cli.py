@@ -16,7 +16,7 @@ import click
 
 from torchmeso.backends.allocator import keep_freed_memory
 from torchmeso.cli_compress import compress
-from torchmeso.cli_synthesize import synthesize
+from torchmeso.cli_synthesize import synthesize, tile
 from torchmeso.console import progress as _progress
 from torchmeso.console import refuse_to_replace as _refuse_to_replace
 from torchmeso.errors import ConfigError, MesoError, StorageError
@@ -158,6 +158,7 @@ def _bake_one(meso: str, out: Any, force: bool, options: dict[str, Any]) -> None
 
 main.add_command(compress)
 main.add_command(synthesize)
+main.add_command(tile)
 
 
 @main.command()

@@ -1,22 +1,31 @@
-"""The command `synthesize`: small exemplars in, maps of large textures out. Heavy imports stay inside the function.
+"""The commands `synthesize` and `tile`: small exemplars in, maps of large textures and sets of tiles out.
 
-Test: tests/pipeline/test_synthesize.py
+Heavy imports stay inside the functions.
+
+Tests: tests/pipeline/test_synthesize.py
+Tests: tests/pipeline/test_tiles.py
 """
 
 import re
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from torchmeso.console import progress, refuse_to_replace
 from torchmeso.errors import ConfigError
 
+if TYPE_CHECKING:
+    from torchmeso.pipeline.synthesize import Done
+    from torchmeso.pipeline.tiles import Made
+
 
 @click.command()
 @click.argument("exemplar")
-@click.option("--method", default="quilting", type=click.Choice(["quilting"]), show_default=True, help="How to grow.")
-@click.option("--size", default="256", show_default=True, help="Texels of the result: 256, or 400x300 (across x down).")
-@click.option("--patch", type=int, help="Side of a patch in texels [a third of the exemplar's shorter side].")
+@click.option(
+    "--method", default="quilting", type=click.Choice(["quilting", "wang"]), show_default=True, help="How to grow."
+)
+@click.option("--size", help="Texels of the result: 256, or 400x300 (across x down) [256; of a tile the exemplar's].")
+@click.option("--patch", type=int, help="Side of a patch in texels [a third of the exemplar; of tiles half a tile].")
 @click.option("--overlap", type=int, help="Texels by which patches overlap, at most half a patch [a quarter of it].")
 @click.option(
     "--tolerance",
@@ -35,15 +44,28 @@ from torchmeso.errors import ConfigError
 @click.option("--tileable", is_flag=True, help="Make a texture that repeats without a seam.")
 @click.option("--toroidal", is_flag=True, help="The exemplar itself repeats: patches may run over its border.")
 @click.option("--verbatim/--no-verbatim", default=None, help="Whether patches may go on where neighbours came from.")
+@click.option(
+    "--kind",
+    type=click.Choice(["edges", "corners", "any"]),
+    default="edges",
+    show_default=True,
+    help="Tiles: with coloured sides or corners, all c^4 of them; any: 96 for surfaces of any topology.",
+)
+@click.option("--colours", type=int, default=2, show_default=True, help="Tiles: colours of a side or corner, c.")
+@click.option("--band", type=int, help="Tiles: texels across an edge, even, about a feature [a quarter of a tile].")
+@click.option("--candidates", type=int, default=8, show_default=True, help="Tiles: patches cut for each one laid.")
+@click.option("--refine", type=int, default=12, show_default=True, help="Tiles: most patches over seams of each tile.")
 @click.option("--bands", type=int, help="Compare only harmonics below this degree, or so many eigen components [all].")
 @click.option("--seed", type=int, default=0, show_default=True, help="Same seed, same map.")
 @click.option("--debug-pictures", type=click.Path(), help="Folder for pictures of the map, the cuts and the seams.")
-@click.option("--out", required=True, help="The quilting map (.quilt); of a picture also the quilted one (.png).")
+@click.option("--out", required=True, help="A map (.quilt), of a picture also the quilted one (.png); tiles (.tiles).")
 @click.option("--force", is_flag=True, help="Replace an existing file.")
+@click.pass_context
 def synthesize(
+    context: click.Context,
     exemplar: str,
     method: str,
-    size: str,
+    size: str | None,
     bands: int | None,
     seed: int,
     debug_pictures: str | None,
@@ -51,28 +73,106 @@ def synthesize(
     force: bool,
     **options: Any,
 ) -> None:
-    """Quilt the EXEMPLAR, a BTF model (.meso) or a picture, into a map of a larger texture."""
+    """Grow a larger texture from the EXEMPLAR, a BTF model (.meso) or a picture: a quilting map, or a set of tiles."""
+    from torchmeso.pipeline import synthesize as quilting_job
+    from torchmeso.pipeline import tiles as tiles_job
+    from torchmeso.synthesize.quilting import QuiltingOptions
+    from torchmeso.synthesize.wang import WangOptions
+
+    own = _own(context, method, options)
+    refuse_to_replace(out, force)
+    more = {"bands": bands, "seed": seed, "pictures": debug_pictures}
+    with progress() as report:
+        if method == "wang":
+            side = None if size is None else _size(size)
+            if side is not None and side[0] != side[1]:
+                raise ConfigError(f"--size: expected the side of a tile like 64, got '{size}'")
+            wanted = WangOptions(size=side and side[0], **own)
+            line = _of_tiles(out, tiles_job.make(exemplar, wanted, out, report=report, **more))
+        else:
+            wanted = QuiltingOptions(**own)
+            line = _of_quilt(
+                out, quilting_job.quilt(exemplar, _size(size or "256"), wanted, out, report=report, **more)
+            )
+    click.echo(line)
+
+
+@click.command()
+@click.argument("tiles")
+@click.option("--plane", default="16x16", show_default=True, help="Tiles across x down.")
+@click.option(
+    "--order",
+    type=click.Choice(["hash", "scanlines"]),
+    default="hash",
+    show_default=True,
+    help="Colours by a hash of their place, which repeats without a seam, or tile by tile, which does not.",
+)
+@click.option("--seed", type=int, default=0, show_default=True, help="Same seed, same tiling.")
+@click.option("--exemplar", help="What to show: writes a picture (.png) in place of a map.")
+@click.option("--out", required=True, help="The map of the tiled plane (.quilt), or with --exemplar a picture (.png).")
+@click.option("--force", is_flag=True, help="Replace an existing file.")
+def tile(tiles: str, plane: str, order: str, seed: int, exemplar: str | None, out: str, force: bool) -> None:
+    """Lay a set of TILES (.tiles) over the plane, and write it as a map that materials are laid out by."""
     from pathlib import Path
 
     from torchmeso.errors import human_size
-    from torchmeso.pipeline import synthesize as job
-    from torchmeso.synthesize.quilting import QuiltingOptions
+    from torchmeso.pipeline import tiles as job
 
     refuse_to_replace(out, force)
-    with progress() as report:
-        quilt, source = job.quilt(
-            exemplar, _size(size), QuiltingOptions(**options), out,
-            bands=bands, seed=seed, pictures=debug_pictures, report=report,
-        )  # fmt: skip
-    height, width = quilt.map.texels
+    found = job.lay(tiles, _size(plane, "--plane"), out, hashed=order == "hash", seed=seed, exemplar=exemplar)
+    height, width = found.texels
     click.echo(
+        f"{out}  {plane} tiles, {width} x {height} texels from {found.source[1]} x {found.source[0]}  "
+        f"{human_size(Path(out).stat().st_size)}"
+    )
+
+
+QUILTING_ONLY = ("overlap", "tolerance", "rule", "tileable", "verbatim")
+WANG_ONLY = ("kind", "colours", "band", "candidates", "refine")
+
+
+def _own(context: click.Context, method: str, options: dict[str, Any]) -> dict[str, Any]:
+    """Return the options of a method.
+
+    Raises:
+        ConfigError: one of the other's was given.
+    """
+    others = QUILTING_ONLY if method == "wang" else WANG_ONLY
+    for name in others:
+        source = context.get_parameter_source(name)
+        if source is not None and source.name == "COMMANDLINE":
+            raise ConfigError(f"--{name}: not an option of --method {method}; leave it out")
+    return {name: value for name, value in options.items() if name not in others}
+
+
+def _of_quilt(out: str, found: "Done") -> str:
+    from pathlib import Path
+
+    from torchmeso.errors import human_size
+
+    quilt, source = found
+    height, width = quilt.map.texels
+    return (
         f"{out}  {width} x {height} texels from {source.texels[1]} x {source.texels[0]}  "
         f"{human_size(Path(out).stat().st_size)}  {int(quilt.patch.max()) + 1} patches, {quilt.within:.0%} within "
         f"tolerance  {source.codes.shape[2]} channels, {100 * source.kept:.4g} % of the variance"
     )
 
 
-def _size(text: str) -> tuple[int, int]:
+def _of_tiles(out: str, found: "Made") -> str:
+    from pathlib import Path
+
+    from torchmeso.errors import human_size
+
+    tiles, source = found.wang.set, found.source
+    return (
+        f"{out}  {len(tiles.index)} tiles of {tiles.side} x {tiles.side} texels from {source.texels[1]} x "
+        f"{source.texels[0]}, {tiles.share:.1%} of them referenced  {human_size(Path(out).stat().st_size)}  "
+        f"{source.codes.shape[2]} channels, {100 * source.kept:.4g} % of the variance"
+    )
+
+
+def _size(text: str, name: str = "--size") -> tuple[int, int]:
     """Return height and width of "256" or "400x300".
 
     Raises:
@@ -80,5 +180,5 @@ def _size(text: str) -> tuple[int, int]:
     """
     found = re.fullmatch(r"(\d+)(?:x(\d+))?", text.strip().lower())
     if found is None:
-        raise ConfigError(f"--size: expected texels like 256 or 400x300, got '{text}'")
+        raise ConfigError(f"{name}: expected numbers like 256 or 400x300, got '{text}'")
     return int(found[2] or found[1]), int(found[1])

@@ -32,11 +32,20 @@ def test_rows_on_small_models(monkeypatch, rng, device, tmp_path):
     monkeypatch.setattr(synthesize, "model", lambda kind, context: small)
     monkeypatch.setattr(synthesize, "LARGE", (40, 40))
     monkeypatch.setattr(synthesize, "PAIRS", 2)
+    monkeypatch.setattr(synthesize.wang, "SIDE", 16)
+    monkeypatch.setattr(synthesize.wang, "PLANE", 3)
     monkeypatch.setattr(synthesize, "data_dir", lambda: tmp_path)
     context = Context(quick=True)
     found = {}
-    for measure in (synthesize.times, synthesize.search, synthesize.seams_by_dp, synthesize.seam_energy):
+    for measure in (
+        synthesize.times,
+        synthesize.search,
+        synthesize.seams_by_dp,
+        synthesize.seam_energy,
+        synthesize.tile_seams,
+    ):
         found |= {row.id.removeprefix("synthesize."): row for row in measure(context)}
+    assert found["tiles.relit.borders.brick"].value > 0 and found["tiles.relit.seams.weave"].value > 0
     assert found["search.error"].value == 0 and found["search.error"].met
     assert found["seams.pictures"].value is None and "TORCHMESO_DATA" in found["seams.pictures"].why
     assert found["seams.brick"].value > 0 and found["seam_dp.64"].value > 0

@@ -56,7 +56,7 @@ def test_a_model_gives_the_map_that_the_library_gives(kind, container, rng, tmp_
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        (["--size", "4by4"], "--size: expected texels like 256 or 400x300, got '4by4'"),
+        (["--size", "4by4"], "--size: expected numbers like 256 or 400x300, got '4by4'"),
         (["--patch", "21"], "expected at most the exemplar's shorter side, 20 texels, got 21"),
         (["--patch", "8", "--overlap", "5"], "expected at most half a patch of 8 texels, got 5"),
         (["--tolerance", "-1"], "quilting.tolerance: expected a value from 0"),

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchmeso.bench import frames, speed
+from torchmeso.bench import frames, graphcut, speed, wang
 from torchmeso.bench.suite import Context, Measurement, Row
 from torchmeso.bench.timing import time_together
 from torchmeso.config import MaterialConfig, data_dir
@@ -26,7 +26,7 @@ from torchmeso.geometry.directions import from_angles
 from torchmeso.pipeline import bake
 from torchmeso.render.scene import Scene, quilted
 from torchmeso.render.silhouette import Silhouette
-from torchmeso.synthesize import patch_error, quilting, seam_dp
+from torchmeso.synthesize import patch_error, quilting, seam_dp, tiling
 from torchmeso.synthesize.patch_error import Exemplar, Search
 from torchmeso.synthesize.quilting import QuiltingOptions
 
@@ -151,6 +151,26 @@ def seam_energy(context: Context) -> Iterator[Row]:
     )  # fmt: skip
 
 
+def tile_seams(context: Context) -> Iterator[Row]:
+    """What sets of tiles show at their borders and where patches meet inside of them."""
+    for kind in MATERIALS:
+        look = model(kind, context)
+        tiles = wang.grown(look, "edges", toroidal=True)
+        laid = tiles.lay(tiling.plane(tiles, wang.PLANE, wang.PLANE), tileable=True)
+        shown = list(_relit(look))
+        inside = [seam_ratio(picture, laid, wraps=True) for picture in shown]
+        borders = [wang.border_ratio(picture, laid, tiles.side, wraps=True) for picture in shown]
+        for name, where, found in (("borders", "borders of tiles", borders), ("seams", "all seams", inside)):
+            ratios = sorted(found)
+            yield Row(
+                id=f"tiles.relit.{name}.{kind}",
+                what=f"{kind} BTF, 16 tiles of {tiles.side} x {tiles.side} texels under {PAIRS} pairs of light and "
+                f"view: 99th percentile of squared differences across {where} over the exemplar's own, in the middle",
+                value=round(ratios[len(ratios) // 2], 3), unit="x", better="lower", goal=1.0,
+                spread=(round(ratios[0], 3), round(ratios[-1], 3)), n=PAIRS,
+            )  # fmt: skip
+
+
 def seam_ratio(picture: Float[Tensor, "H W C"], quilting: QuiltingMap, *, wraps: bool) -> float:
     """Return the 99th percentile of squared differences across seams over that of the exemplar's neighbours.
 
@@ -226,6 +246,10 @@ MEASUREMENTS = [
     Measurement("synthesize.quilting", times),
     Measurement("synthesize.search", search),
     Measurement("synthesize.seam_dp", seams_by_dp),
+    Measurement("cut", graphcut.cuts),
+    Measurement("tiles.time", wang.times),
+    Measurement("tiles.looks", wang.looks),
+    Measurement("tiles.relit", tile_seams),
     Measurement("synthesize.seams", seam_energy),
     Measurement("synthesize.frame", frame_cost),
 ]

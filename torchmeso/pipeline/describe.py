@@ -10,7 +10,21 @@ from typing import Any
 import torch
 
 from torchmeso import config
-from torchmeso.data import btf, btfdbb, btfdbb_colour, gdm, hsh, image, mdf, picture_set, ptm, quilting_map, rti, store
+from torchmeso.data import (
+    btf,
+    btfdbb,
+    btfdbb_colour,
+    gdm,
+    hsh,
+    image,
+    mdf,
+    picture_set,
+    ptm,
+    quilting_map,
+    rti,
+    store,
+    tile_set,
+)
 from torchmeso.errors import FormatError, human_size
 from torchmeso.geometry import mesh, mesh_file, unwrap
 from torchmeso.geometry.mesh_file import Group
@@ -41,6 +55,8 @@ def file(path: str | Path) -> dict[str, Any]:
         return _model(path)
     if name.endswith(".quilt"):
         return {**quilting_map.describe(path), "on disk": _size(path)}
+    if name.endswith(".tiles"):
+        return {**tile_set.describe(path), "on disk": _size(path)}
     if name.endswith((".lp", ".ptm", ".rti")):
         return _rti(path)
     if name.endswith((".yaml", ".yml")):
@@ -52,7 +68,7 @@ def file(path: str | Path) -> dict[str, Any]:
         return _mesh(path)
     raise FormatError(
         f"{path}: expected a table (.btf.zarr, .mdf.zarr, .gdm.zarr, .btf), a model (.meso), "
-        "a quilting map (.quilt), a configuration (.yaml), a folder or zip of the pictures of a BTF, "
+        "a quilting map (.quilt), tiles (.tiles), a configuration (.yaml), a folder or zip of the pictures of a BTF, "
         "an RTI file (.lp, .ptm, .rti), a picture or a mesh"
     )
 

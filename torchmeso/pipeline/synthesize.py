@@ -69,7 +69,7 @@ def quilt(
     Raises:
         MesoError: a file is missing or no exemplar, or an option is out of range.
     """
-    look, show = _open(Path(path))
+    look, show = open_look(path)
     if Path(out).suffix.lower() not in ((".quilt", ".png") if isinstance(look, Tensor) else (".quilt",)):
         raise ConfigError(f"{out}: expected a name that ends in .quilt, or for a picture in .png")
     report("exemplar", 0)
@@ -88,13 +88,18 @@ def quilt(
     return Done(found, source)
 
 
-def _open(path: Path) -> tuple[Look, Callable[[], Float[Tensor, "H W 3"]]]:
-    """Return what to quilt, and what shows it as a picture. Of pictures sRGB values are compared, as eyes do."""
+def open_look(path: str | Path) -> tuple[Look, Callable[[], Float[Tensor, "H W 3"]]]:
+    """Return what to grow from, and what shows it as a picture. Of pictures sRGB values are compared, as eyes do.
+
+    Raises:
+        FormatError: the file is missing, damaged, or neither a model nor a picture.
+    """
+    path = Path(path)
     if path.suffix.lower() in PICTURES:
         shown = image.read(path)
         return image.to_srgb(shown), lambda: shown
     if path.suffix.lower() != ".meso":
-        raise FormatError(f"{path}: expected a model (.meso) or a picture ({', '.join(PICTURES)}) to quilt")
+        raise FormatError(f"{path}: expected a model (.meso) or a picture ({', '.join(PICTURES)})")
     btf = open_model(path, depth=False).btf
     assert isinstance(btf, patch_error.Look)
 
