@@ -36,7 +36,10 @@ def test_it_opens_as_an_eigen_btf_that_is_as_near(colour, tmp_path):
     factored_btf.save(model, tmp_path / "a.meso")
     opened = open_model(tmp_path / "a.meso").btf
     assert opened.rank == model.opened_rank
-    assert budget.psnr(T, opened) > budget.psnr_of(T, model.rows(0, 12)) - 0.35  # measured 0.1 to 0.2
+    assert (
+        budget.psnr_of(T, torch.einsum("lhwkc,vk->lvhwc", opened.decoded(), opened.weights))
+        > budget.psnr_of(T, model.rows(0, 12)) - 0.35
+    )  # measured 0.1 to 0.2
     assert open_model(tmp_path / "a.meso", rank=2).btf.rank == 2
 
 

@@ -61,7 +61,7 @@ class Hsh:
 
         Coefficients, which are linear, are interpolated between texels.
         """
-        taps = address.bilinear(uv, *self.codes.shape[:2])
+        taps = address.bilinear(uv, self.codes.shape[0], self.codes.shape[1])
         codes = (self.codes.flatten(0, 1)[taps.texel].to(uv.dtype) * taps.weight[..., None, None]).sum(-3)
         coefficients = codes / 255 * self.scale.to(uv.dtype) + self.bias.to(uv.dtype)
         srgb = (coefficients * basis(wi, self.codes.shape[-1]).unsqueeze(-2)).sum(-1)

@@ -65,7 +65,7 @@ class Ptm:
 
         Coefficients, which are linear, are interpolated between texels.
         """
-        taps = address.bilinear(uv, *self.codes.shape[:2])
+        taps = address.bilinear(uv, self.codes.shape[0], self.codes.shape[1])
         codes = _interpolate(self.codes.flatten(0, 1), taps)
         a = (codes - self.bias.to(uv.dtype)) * self.scale.to(uv.dtype)
         srgb = (a * basis(wi).unsqueeze(-2)).sum(-1) / 255
