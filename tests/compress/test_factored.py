@@ -43,6 +43,13 @@ def test_it_opens_as_an_eigen_btf_that_is_as_near(colour, tmp_path):
     assert open_model(tmp_path / "a.meso", rank=2).btf.rank == 2
 
 
+def test_large_and_tiny_values_fit_into_halves(few):
+    for unit in (1e5, 1e-5):
+        table = Btf(images=few.images * unit, lights=LIGHTS, views=VIEWS)
+        model = factored.fit(table, FactoredOptions(rank=3))
+        assert budget.psnr_of(table.images, model.rows(0, 5)) > 50
+
+
 def test_one_row_after_the_other_is_the_whole(few):
     model = factored.fit(few, FactoredOptions(rank=2))
     assert torch.equal(torch.cat([model.rows(r, r + 1) for r in range(5)], 2), model.rows(0, 5))

@@ -78,6 +78,7 @@ def fit(
     # Rows of P are pairs, the light first; rows of S begin with the lowest row of texels.
     by_pair = torch.stack([P.unflatten(0, (n_view, n_light)).transpose(0, 1) for P, _ in factors])
     by_texel = torch.stack([S.unflatten(0, (height, width)).flip(0) for _, S in factors])
+    by_pair, by_texel = _balanced(by_pair, by_texel)
     model = FactoredBtf(
         by_pair=by_pair.half().float(), by_texel=by_texel.half().float(), colour=colour, opened_rank=n_view,
         lights=btf.lights, views=btf.views,
@@ -86,6 +87,15 @@ def fit(
     left_out = torch.linalg.eigvalsh(total).clamp(min=0).cumsum(0).flip(0)  # by 0, 1, ... components
     needed = int((left_out > SHARE * error).sum())
     return replace(model, opened_rank=min(n_view, max(1, needed)))
+
+
+def _balanced(by_pair: Float[Tensor, "3 light view k"], by_texel: Float[Tensor, "3 H W k"]) -> tuple[Tensor, Tensor]:
+    """Return factors whose largest values are as large in both: halves end at 65,504, their products at 4e9."""
+    largest = [
+        x.abs().amax((1, 2), keepdim=True).clamp(min=torch.finfo(torch.float32).tiny) for x in (by_pair, by_texel)
+    ]
+    factor = (largest[1] / largest[0]).sqrt()
+    return by_pair * factor, by_texel / factor
 
 
 def check(btf: Bands, options: FactoredOptions) -> DfmfOptions:
