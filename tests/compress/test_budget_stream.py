@@ -5,13 +5,14 @@ from dataclasses import replace
 import pytest
 import torch
 
-from torchmeso.compress import budget_stream, double_sh_budget, eigen_budget, transform
+from torchmeso.compress import budget_stream, double_sh_budget, eigen_budget, kept_maps, transform
 from torchmeso.compress.budget import Budget
 from torchmeso.compress.double_sh import DoubleShOptions
 from torchmeso.compress.eigen import EigenOptions
 from torchmeso.compress.transform import TransformOptions
 from torchmeso.data import bands, btf, eigen_btf, sh_btf, store, transform_btf
 from torchmeso.data.btf import Btf
+from torchmeso.data.journal import Journal
 from torchmeso.errors import ConfigError
 from torchmeso.geometry import hemisphere
 
@@ -122,16 +123,33 @@ def test_a_search_that_was_killed_goes_on(name, table, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("name", JOBS)
-def test_no_more_than_two_bands_are_read_at_a_time(name, table, tmp_path, monkeypatch):
-    """Memory is that of a band and a map, whatever the height of the texture is."""
+def test_rows_and_maps_alone_are_in_memory(name, table, tmp_path, monkeypatch):
+    """What is read, kept or collected at a time is a row of texels or a map, whatever the size of the texture."""
     monkeypatch.setattr(bands, "ROOM", 1)
+    monkeypatch.setattr(kept_maps, "ROOM", 1)
     monkeypatch.setattr(Btf, "pictures", None)
     monkeypatch.setattr(Btf, "_stored", None)
-    rows = []
-    stored_rows = Btf.stored_rows
-    monkeypatch.setattr(Btf, "stored_rows", lambda self, a, b, *c: rows.append(b - a) or stored_rows(self, a, b, *c))
+    rows, sizes = [], []
+    stored_rows, write, read = Btf.stored_rows, Journal.write, Journal.read
+
+    def counted(self, start, stop, *more):
+        if not isinstance(self.images, torch.Tensor):
+            rows.append(stop - start)
+        return stored_rows(self, start, stop, *more)
+
+    def sized(self, *place, **which):
+        found = read(self, *place, **which)
+        sizes.append(found.numel())
+        return found
+
+    monkeypatch.setattr(Btf, "stored_rows", counted)
+    monkeypatch.setattr(Journal, "write", lambda self, name, x: sizes.append(x.numel()) or write(self, name, x))
+    monkeypatch.setattr(Journal, "read", sized)
     fit(table, name, tmp_path / "a.meso")
     assert set(rows) == {1}
+    row, of_a_map = 18 * 15 * 8 * 3, 18 * 8 * 8 * 3
+    grams = 18**2 + 15**2 + 3**2
+    assert max(n for n in sizes if n != 2 * transform.BINS) <= max(row + grams, of_a_map)
 
 
 @pytest.mark.errors

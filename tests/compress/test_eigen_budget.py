@@ -87,8 +87,8 @@ def test_budgets_that_cannot_be_kept_are_refused(storage, brick):
 def test_what_eight_bits_lose_is_not_found_rank_by_rank(brick, monkeypatch):
     """A budget just above what eight bits can do takes few fits, not one for each rank."""
     fits = []
-    scores = eigen.scores
-    monkeypatch.setattr(eigen, "scores", lambda *a, **k: fits.append(1) or scores(*a, **k))
+    scores = eigen_budget.kept_scores
+    monkeypatch.setattr(eigen_budget, "kept_scores", lambda *a, **k: fits.append(1) or scores(*a, **k))
     with pytest.raises(ConfigError, match="cannot be reached"):
         eigen_budget.fit(brick, Budget(psnr=70))
     assert len(fits) <= 3

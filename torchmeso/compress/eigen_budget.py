@@ -228,7 +228,7 @@ def kept_scores(
         parts=parts, name=name, layout=layout, count=W.shape[1], before=(len(btf.lights),), after=(width, 3),
         dtype=torch.float32,
     )  # fmt: skip
-    maps.keep(eigen.scores(btf, W, maps.todo()), progress)
+    maps.keep_rows(btf, lambda samples: eigen.scores_of(samples, W), progress)
     return maps
 
 

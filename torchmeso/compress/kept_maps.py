@@ -1,13 +1,15 @@
 """Maps that a fit computes in bands of texel rows and needs one by one: kept in a job's parts (`data.journal`).
 
 Fits read a table in bands, all directions at once; codes need the range of a whole map, and files hold map after map.
-One part holds all maps of a band, so a fit that was stopped goes on behind the last band it kept, and collecting a
-map reads that map alone. The codes of a map lie with the texel rows outermost: what all of them show of a few rows is
+One part holds all maps of a piece of a band, `ROOM` at most, so that maps of float32 take no more memory than the bytes
+that they are computed from. A fit that was stopped goes on behind the last piece it kept, and collecting a map reads
+that map alone. The codes of a map lie with the texel rows outermost: what all of them show of a few rows is
 read without the others.
 
 Test: tests/compress/test_kept_maps.py
 """
 
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
@@ -15,7 +17,12 @@ import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor
 
+from torchmeso.data import bands
+from torchmeso.data.btf import Bands
 from torchmeso.data.journal import Parts
+
+ROOM = 64 << 20
+"""Memory of the maps of a piece of a band."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -25,7 +32,7 @@ class KeptMaps:
     Attributes:
         parts: of the job.
         name: of the maps in it.
-        layout: bands of texel rows.
+        layout: bands of texel rows that the table is read in.
         count: maps.
         before: axes of a map before its texel rows.
         after: axes behind them.
@@ -40,45 +47,94 @@ class KeptMaps:
     after: tuple[int, ...]
     dtype: torch.dtype
 
+    @property
+    def step(self) -> int:
+        """Texel rows of a piece."""
+        row = math.prod((self.count, *self.before, *self.after)) * self.dtype.itemsize
+        return max(1, ROOM // row)
+
     def todo(self) -> list[slice]:
-        """Return the bands that are not there yet."""
-        return [rows for rows in self.layout if not self.parts.has(self._part(rows), self._shape(rows), self.dtype)]
+        """Return the bands that are not all there yet, from their first piece that is missing on."""
+        found = []
+        for band in self.layout:
+            missing = [piece for piece in pieces(band, self.step) if not self._has(piece)]
+            if missing:
+                found.append(slice(missing[0].start, band.stop))
+        return found
 
     def keep(
         self,
-        bands: Iterable[tuple[slice, Shaped[Tensor, "map *axes"]]],
+        computed: Iterable[tuple[slice, Shaped[Tensor, "map *axes"]]],
         progress: Callable[[float], None] = lambda share: None,
     ) -> None:
-        """Keep bands of all maps as they are computed; `progress` is called with the share of the texture."""
-        for rows, values in bands:
-            self.parts.write(self._part(rows), values)
+        """Keep pieces of all maps as they are computed; `progress` is called with the share of the texture."""
+        for rows, values in computed:
+            for piece in pieces(rows, self.step):
+                first = piece.start - rows.start
+                self._write(piece, values.narrow(1 + len(self.before), first, piece.stop - piece.start))
             progress(rows.stop / self.layout[-1].stop)
+
+    def keep_rows(
+        self,
+        btf: Bands,
+        of_row: Callable[[Float[Tensor, "light view W 3"]], Shaped[Tensor, "map *axes"]],
+        progress: Callable[[float], None] = lambda share: None,
+    ) -> None:
+        """Keep what is not there yet, computed texel row by texel row; black rows have maps of zeros and cost nothing.
+
+        Raises:
+            FormatError: the file on disk is damaged.
+            ShapeError: a value of the BTF is not finite.
+        """
+        for band in bands.ahead(btf, self.todo()):
+            for piece in pieces(band.rows, self.step):
+                found = torch.zeros(self._shape(piece), dtype=self.dtype)
+                for at in range(piece.stop - piece.start):
+                    samples = bands.linear_row(btf, band, piece.start - band.rows.start + at)
+                    if bool(samples.any()):
+                        found.select(1 + len(self.before), at).copy_(of_row(samples))
+                self._write(piece, found)
+            progress(band.rows.stop / self.layout[-1].stop)
 
     def collected(self, first: int, count: int = 1) -> Shaped[Tensor, "map *axes"]:
         """Return `count` whole maps, reading no others."""
         height, axis = self.layout[-1].stop, 1 + len(self.before)
         found = torch.empty(count, *self.before, height, *self.after, dtype=self.dtype)
-        for rows in self.layout:
+        for rows in self._pieces():
             part = self.parts.read(self._part(rows), self._shape(rows), self.dtype, first=first, count=count)
             found.narrow(axis, rows.start, rows.stop - rows.start).copy_(part)
         return found
 
     def row(self, row: int) -> Shaped[Tensor, "map *axes"]:
-        """Return all maps of one row of texels; its band is read."""
-        rows = next(rows for rows in self.layout if row < rows.stop)
+        """Return all maps of one row of texels; its piece is read."""
+        rows = next(rows for rows in self._pieces() if row < rows.stop)
         part = self.parts.read(self._part(rows), self._shape(rows), self.dtype)
         return part.select(1 + len(self.before), row - rows.start)
 
     def drop(self) -> None:
         """Forget the maps."""
-        for rows in self.layout:
+        for rows in self._pieces():
             self.parts.drop(self._part(rows))
+
+    def _write(self, piece: slice, values: Tensor) -> None:
+        self.parts.write(self._part(piece), values.contiguous())
+
+    def _pieces(self) -> list[slice]:
+        return [piece for band in self.layout for piece in pieces(band, self.step)]
+
+    def _has(self, rows: slice) -> bool:
+        return self.parts.has(self._part(rows), self._shape(rows), self.dtype)
 
     def _part(self, rows: slice) -> str:
         return f"{self.name}.{rows.start}-{rows.stop}"
 
     def _shape(self, rows: slice) -> tuple[int, ...]:
         return self.count, *self.before, rows.stop - rows.start, *self.after
+
+
+def pieces(band: slice, step: int) -> list[slice]:
+    """Return `band` in pieces of `step` rows of texels, the last one as many as are left."""
+    return [slice(start, min(start + step, band.stop)) for start in range(band.start, band.stop, step)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

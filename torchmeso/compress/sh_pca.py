@@ -193,7 +193,12 @@ def fit_parts(
         parts=parts, name="W", layout=tuple(layout), count=options.rank, before=(len(btf.views),),
         after=(btf.texels[1],), dtype=torch.float32,
     )  # fmt: skip
-    maps.keep(_weights(btf, P, components.float(), maps.todo()), lambda share: progress(0.5 + 0.5 * share))
+    V, around = components.float(), (len(btf.views), btf.texels[1])
+
+    def weights(samples: Float[Tensor, "light view W 3"]) -> Float[Tensor, "rank view W"]:
+        return (_vectors(samples, P) @ V).unflatten(0, around).permute(2, 0, 1)
+
+    maps.keep_rows(btf, weights, lambda share: progress(0.5 + 0.5 * share))
     b = torch.einsum("mn,nck->kmc", through.coefficient, components.unflatten(0, (-1, 3)))
     return Fitted(maps, b.float())
 
@@ -233,18 +238,6 @@ def _grams(
             z = z if trained is None else z[trained[row]]
             total = total + (z.mT @ z).double()
         yield rows, total
-
-
-def _weights(
-    btf: Bands, P: Float[Tensor, "n light"], V: Float[Tensor, "vector rank"], wanted: Sequence[slice]
-) -> Iterator[tuple[slice, Float[Tensor, "rank view rows W"]]]:
-    """Yield bands of texel rows and the weights of all components there."""
-    for band in bands.ahead(btf, wanted):
-        _, n_view, height, width, _ = band.stored.shape
-        W = torch.empty(V.shape[1], n_view, height, width)
-        for row, samples in enumerate(bands.each_row(btf, band)):
-            W[:, :, row] = (_vectors(samples, P) @ V).unflatten(0, (n_view, width)).permute(2, 0, 1)
-        yield band.rows, W
 
 
 def _vectors(samples: Float[Tensor, "light view W 3"], P: Float[Tensor, "n light"]) -> Float[Tensor, "_ vector"]:

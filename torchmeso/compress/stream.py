@@ -21,6 +21,7 @@ from torchmeso.backends import BackendChoice
 from torchmeso.compress import double_sh, eigen, factored, quantize, sh_pca
 from torchmeso.compress.double_sh import DoubleShOptions, quantised
 from torchmeso.compress.eigen import EigenOptions
+from torchmeso.compress.eigen_budget import kept_scores
 from torchmeso.compress.factored import FactoredOptions
 from torchmeso.compress.kept_maps import KeptMaps
 from torchmeso.compress.sh_pca import ShPcaOptions
@@ -134,7 +135,7 @@ def _fit_eigen(
     progress: Progress,
 ) -> None:
     height, width = btf.texels
-    n_light, n_view = len(btf.lights), len(btf.views)
+    n_view = len(btf.views)
     square = n_view, n_view
     total, todo = torch.zeros(square, dtype=torch.float64), layout
     for at, rows in enumerate(layout):
@@ -146,12 +147,7 @@ def _fit_eigen(
         progress(0.4 * rows.stop / height)
     W = right_basis(total, options.rank).vectors.float()
 
-    maps = KeptMaps(
-        parts=kept, name="E", layout=tuple(layout), count=options.rank, before=(n_light,), after=(width, 3),
-        dtype=torch.float32,
-    )  # fmt: skip
-    maps.keep(eigen.scores(btf, W, maps.todo()), lambda share: progress(0.4 + 0.4 * share))
-
+    maps = kept_scores(btf, W, kept, "E", lambda share: progress(0.4 + 0.4 * share))
     step = None
     if options.storage == "adaptive":
         spreads = (quantize.spread(maps.collected(k)[0]) for k in range(options.rank))

@@ -205,25 +205,15 @@ def _kept(btf: Bands, bases: Sequence[Tensor], parts: Parts, progress: Progress)
         parts=parts, name="C", layout=tuple(bands.layout(btf)), count=bases[1].shape[1],
         before=(bases[0].shape[1], 3), after=(btf.texels[1],), dtype=torch.float32,
     )  # fmt: skip
-    maps.keep(_coefficients(btf, bases, maps.todo()), progress)
-    return maps
-
-
-def _coefficients(
-    btf: Bands, bases: Sequence[Tensor], wanted: Sequence[slice]
-) -> Iterator[tuple[slice, Float[Tensor, "rank term 3 rows W"]]]:
-    """Yield bands of texel rows and their coefficients, the products and cosines texel row by texel row."""
     light, view, colour = bases
-    for band in bands.ahead(btf, wanted):
-        rows, width = band.stored.shape[2:4]
-        C = torch.zeros(view.shape[1], light.shape[1], 3, rows, width)
-        for at, samples in enumerate(bands.each_row(btf, band)):
-            if not bool(samples.any()):
-                continue
-            over_view = view.T @ samples.flatten(2)  # (light, rank, W 3)
-            over_light = (light.T @ over_view.flatten(1)).unflatten(1, (-1, width, 3))
-            C[:, :, :, at] = cosines((over_light @ colour).permute(1, 0, 3, 2), along=(-1,))
-        yield band.rows, C
+
+    def of_row(samples: Float[Tensor, "light view W 3"]) -> Float[Tensor, "rank term 3 W"]:
+        over_view = view.T @ samples.flatten(2)  # (light, rank, W 3)
+        over_light = (light.T @ over_view.flatten(1)).unflatten(1, (-1, samples.shape[2], 3))
+        return cosines((over_light @ colour).permute(1, 0, 3, 2), along=(-1,))
+
+    maps.keep_rows(btf, of_row, progress)
+    return maps
 
 
 def _component(maps: KeptMaps, k: int, terms: int | None = None) -> Float[Tensor, "term 3 H W"]:
