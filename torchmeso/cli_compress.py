@@ -3,7 +3,7 @@
 Test: tests/test_cli.py
 """
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import partial
 from typing import Any
 
@@ -91,9 +91,9 @@ def compress(
 
     A BTF is a .btf.zarr or .btf, a folder or zip of pictures, or an RTI set (.lp); a GDM is a .gdm.zarr.
     """
-    from torchmeso.compress import factored, stream, transform
-    from torchmeso.compress.budget import Budget
-    from torchmeso.data import factored_btf, journal, mdf, transform_btf
+    from torchmeso.compress import budget_stream, stream
+    from torchmeso.compress.eigen import EigenOptions
+    from torchmeso.data import journal, mdf
     from torchmeso.pipeline import picture_sets
     from torchmeso.pipeline.bake import code_hash
 
@@ -108,23 +108,18 @@ def compress(
     refuse_to_replace(out, force)
     depth = None if silhouette is None else mdf.load(silhouette)
     chosen, wanted = _asked(method, unbounded, options)
-    said = out
     with progress() as report:
         source = picture_sets.open_btf(table, report, allow_missing=allow_missing)
         told = partial(report, f"{method} BTF")
-        if isinstance(chosen, transform.TransformOptions):
-            packed, found = transform.fit(source, chosen, progress=told)
-            transform_btf.save(packed, out, silhouette=depth, psnr=round(found, 2))
-            said = f"{out}  PSNR {found:.1f} dB  {len(packed.codes)} of {len(packed.views)} view components"
-        elif isinstance(chosen, factored.FactoredOptions):
-            factors = factored.fit(source, chosen, progress=told)
-            factored_btf.save(factors, out, silhouette=depth)
-            said = f"{out}  opens as an eigen BTF of rank {factors.opened_rank}"
-        elif isinstance(wanted, Budget):
-            said = _to_budget(source, chosen, wanted, options["rank"], out, depth, told)
+        key = f"{journal.state_of(table)} {code_hash()}"
+        if wanted is not None:
+            if isinstance(chosen, EigenOptions):
+                chosen = replace(chosen, rank=options["rank"] or len(source.views))
+            found = budget_stream.fit(source, chosen, wanted, out, key=key, silhouette=depth, progress=told)
+            said = f"{out}  PSNR {found:.1f} dB  {_kept(out)}"
         else:
-            key = f"{journal.state_of(table)} {code_hash()}"
             stream.fit(source, chosen, out, key=key, silhouette=depth, progress=told)
+            said = f"{out}  {_kept(out)}" if method == "factored" else out
     click.echo(said)
 
 
@@ -143,7 +138,7 @@ def _asked(method: str, unbounded: bool, options: dict[str, Any]) -> tuple[Any, 
     known = {field.name for field in fields(kinds[method])}
     if method in ("transform", "factored") and given["storage"] == "uint8":
         del given["storage"]  # the default of the others
-    limits = {"psnr", "size"} if method in ("eigen", "double-sh") else set()
+    limits = {"psnr", "size"} if method in ("eigen", "double-sh", "transform") else set()
     if (wrong := sorted(set(given) - known - limits)) or (unbounded and method != "double-sh"):
         raise ConfigError(f"compress: --method {method} has no --{(wrong or ['unbounded'])[0].replace('_', '-')}")
     if unbounded:
@@ -151,27 +146,25 @@ def _asked(method: str, unbounded: bool, options: dict[str, Any]) -> tuple[Any, 
     if "size" in given:
         given["size"] = budget.parse_size(given["size"])
     limited = {name: given.pop(name) for name in limits & set(given)}
-    if not limited:
+    if not limited and method != "transform":
         return kinds[method](**given), None
-    given.pop("rank", None)  # then the most of them
     most = {"light_terms": 36, "view_terms": 36} if method == "double-sh" else {}
     return kinds[method](**{**most, **given}), budget.Budget(**limited)
 
 
-def _to_budget(source: Any, chosen: Any, wanted: Any, most: int | None, out: str, depth: Any, told: Any) -> str:
-    """Write the model that keeps a budget; return what to say about it."""
-    from torchmeso.compress import double_sh_budget, eigen_budget
-    from torchmeso.compress.eigen import EigenOptions
-    from torchmeso.data import eigen_btf, sh_btf
+def _kept(out: str) -> str:
+    """Return what a fit made of itself, in words."""
+    from torchmeso.data import store
+    from torchmeso.geometry import hemisphere
 
-    coded = chosen.storage == "adaptive"
-    if isinstance(chosen, EigenOptions):
-        eigen, found = eigen_budget.fit(source, wanted, storage=chosen.storage, rank=most, progress=told)
-        eigen_btf.save(eigen, out, silhouette=depth, coded=coded, psnr=round(found, 2))
-        return f"{out}  PSNR {found:.1f} dB  rank {eigen.rank} of {len(eigen.views)}"
-    harmonic, found = double_sh_budget.fit(source, wanted, chosen, backend="auto", progress=told)
-    sh_btf.save(harmonic, out, silhouette=depth, coded=coded, psnr=round(found, 2))
-    return f"{out}  PSNR {found:.1f} dB  " + "{} x {} coefficients of light and view".format(*harmonic.terms)
+    meta = store.Model(out).meta
+    if "sh" in meta:
+        return "{} x {} coefficients of light and view".format(*meta["sh"]["terms"])
+    if "factored" in meta:
+        return f"opens as an eigen BTF of rank {meta['factored']['opened_rank']}"
+    about = meta.get("transform") or meta["eigen"]
+    of, views = f"of {len(hemisphere.parse(about['views']))}", about["rank"]
+    return f"{views} {of} view components" if "transform" in meta else f"rank {views} {of}"
 
 
 def _relight(lights: str, method: Any, out: str, force: bool, options: dict[str, Any]) -> None:

@@ -16,13 +16,17 @@ def brick():
     return bake_btf.in_memory(generators.brick(), options)
 
 
+def psnr_of(T, model):
+    return budget.psnr_of(T, torch.einsum("lhwkc,vk->lvhwc", model.decoded(), model.weights))
+
+
 @pytest.mark.parametrize("wanted", [20.0, 30.0, 38.0])
 def test_the_fewest_components_for_an_error(wanted, brick):
     found, psnr = eigen_budget.fit(brick, Budget(psnr=wanted))
     T = brick.pictures().float()
-    assert wanted <= psnr == pytest.approx(budget.psnr(T, found), abs=1e-6)
+    assert wanted <= psnr == pytest.approx(psnr_of(T, found), abs=1e-6)
     fewer = eigen.fit(brick, EigenOptions(rank=found.rank - 1))
-    assert budget.psnr(T, fewer) < wanted
+    assert psnr_of(T, fewer) < wanted
 
 
 @pytest.mark.parametrize("wanted", [20.0, 30.0, 38.0])
@@ -45,6 +49,14 @@ def test_the_size_asked_for_is_kept_by_the_file(storage, brick, tmp_path):
         assert (tmp_path / "a.meso").stat().st_size <= room
         errors.append(psnr)
     assert errors == sorted(errors)
+
+
+@pytest.mark.parametrize("storage", ["uint8", "float16"])
+def test_the_model_is_the_one_of_a_fit_of_that_rank(storage, brick):
+    found, _ = eigen_budget.fit(brick, Budget(psnr=30), storage=storage)
+    plain = eigen.fit(brick, EigenOptions(rank=found.rank, storage=storage))
+    for name in ("maps", "weights", "scale", "offset"):
+        assert torch.equal(getattr(found, name), getattr(plain, name))
 
 
 def test_no_more_components_than_asked_for(brick):
@@ -75,8 +87,8 @@ def test_budgets_that_cannot_be_kept_are_refused(storage, brick):
 def test_what_eight_bits_lose_is_not_found_rank_by_rank(brick, monkeypatch):
     """A budget just above what eight bits can do takes few fits, not one for each rank."""
     fits = []
-    fit = eigen.fit
-    monkeypatch.setattr(eigen, "fit", lambda *a, **k: fits.append(1) or fit(*a, **k))
+    scores = eigen_budget.kept_scores
+    monkeypatch.setattr(eigen_budget, "kept_scores", lambda *a, **k: fits.append(1) or scores(*a, **k))
     with pytest.raises(ConfigError, match="cannot be reached"):
         eigen_budget.fit(brick, Budget(psnr=70))
     assert len(fits) <= 3

@@ -36,8 +36,18 @@ def test_it_opens_as_an_eigen_btf_that_is_as_near(colour, tmp_path):
     factored_btf.save(model, tmp_path / "a.meso")
     opened = open_model(tmp_path / "a.meso").btf
     assert opened.rank == model.opened_rank
-    assert budget.psnr(T, opened) > budget.psnr_of(T, model.rows(0, 12)) - 0.35  # measured 0.1 to 0.2
+    assert (
+        budget.psnr_of(T, torch.einsum("lhwkc,vk->lvhwc", opened.decoded(), opened.weights))
+        > budget.psnr_of(T, model.rows(0, 12)) - 0.35
+    )  # measured 0.1 to 0.2
     assert open_model(tmp_path / "a.meso", rank=2).btf.rank == 2
+
+
+def test_large_and_tiny_values_fit_into_halves(few):
+    for unit in (1e5, 1e-5):
+        table = Btf(images=few.images * unit, lights=LIGHTS, views=VIEWS)
+        model = factored.fit(table, FactoredOptions(rank=3))
+        assert budget.psnr_of(table.images, model.rows(0, 5)) > 50
 
 
 def test_one_row_after_the_other_is_the_whole(few):

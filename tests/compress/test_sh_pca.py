@@ -8,7 +8,7 @@ from tests.tolerances import FLOAT64
 from torchmeso.algebra.spherical_harmonics import basis
 from torchmeso.compress import sh_pca
 from torchmeso.compress.sh_pca import ShPcaOptions
-from torchmeso.data import image, ubo2003
+from torchmeso.data import bands, image, ubo2003
 from torchmeso.data.btf import Btf
 from torchmeso.errors import ConfigError, ShapeError
 from torchmeso.geometry import cube_map, hemisphere
@@ -119,7 +119,7 @@ def test_bands_give_the_same_bits(training, rng, monkeypatch):
     btf = table(rng, 5, 7, noise=0.1)
     options = ShPcaOptions(rank=4, light_terms=9, training=training)
     whole = sh_pca.fit(btf, options)
-    monkeypatch.setattr(sh_pca, "BAND_BYTES", 1)
+    monkeypatch.setattr(bands, "ROOM", 1)
     parts = sh_pca.fit(btf, options)
     assert torch.equal(whole.maps, parts.maps)
     assert torch.equal(whole.basis, parts.basis)
@@ -137,9 +137,11 @@ def test_training_reads_only_rows_that_have_a_sample(rng):
             asked.append((start, stop))
             return btf.rows(start, stop)
 
-    rows = [row for row, _ in sh_pca._vectors(Watched(), torch.zeros(9, 81), {5, 6, 40})]
-    assert rows == [5, 6, 40]
-    assert asked == [(5, 41)]  # one band: from the first to the last
+    trained = {row: torch.tensor([3, 5]) for row in (5, 6, 40)}
+    layout, P = [slice(0, 32), slice(32, 39), slice(39, 64)], torch.ones(9, 81)
+    found = list(sh_pca._grams(Watched(), P, trained, layout, torch.zeros(27, 27, dtype=torch.float64)))
+    assert [rows for rows, _ in found] == [slice(0, 32), slice(39, 64)]
+    assert asked == [(5, 7), (40, 41)]  # of each band, from the first to the last
 
 
 def test_eight_bits_are_an_error_at_the_lights_and_not_of_coefficients(rng):

@@ -1,10 +1,12 @@
 import pytest
 import torch
 
-from torchmeso.compress import double_sh, eigen, stream
+from torchmeso.compress import double_sh, eigen, factored, sh_pca, stream
 from torchmeso.compress.double_sh import DoubleShOptions
 from torchmeso.compress.eigen import EigenOptions
-from torchmeso.data import bands, btf, eigen_btf, sh_btf, store
+from torchmeso.compress.factored import FactoredOptions
+from torchmeso.compress.sh_pca import ShPcaOptions
+from torchmeso.data import bands, btf, eigen_btf, factored_btf, sh_btf, sh_pca_btf, store
 from torchmeso.data.btf import Btf
 from torchmeso.data.mdf import Mdf
 from torchmeso.errors import ConfigError
@@ -15,10 +17,16 @@ OPTIONS = {
     "double-sh": DoubleShOptions(light_terms=9, view_terms=4),
     "double-sh float16": DoubleShOptions(light_terms=4, view_terms=9, storage="float16"),
     "double-sh adaptive": DoubleShOptions(light_terms=4, view_terms=9, storage="adaptive"),
+    "sh-pca": ShPcaOptions(rank=5, light_terms=9),
+    "sh-pca trained": ShPcaOptions(rank=3, light_terms=4, training=20, storage="float16"),
+    "factored": FactoredOptions(rank=4),
     "eigen": EigenOptions(rank=3),
     "eigen adaptive": EigenOptions(rank=3, storage="adaptive"),
     "eigen float32": EigenOptions(rank=2, storage="float32"),
 }
+
+BANDS = [name for name in OPTIONS if name not in ("factored", "sh-pca trained")]
+"""What is kept band by band; factors are kept pass by pass."""
 
 
 @pytest.fixture
@@ -42,12 +50,17 @@ def test_the_file_is_the_one_of_a_fit_in_memory(name, depth, table, tmp_path, rn
     if depth:
         mdf = Mdf(delta=torch.rand(15, 6, 7, generator=rng).half(), no_hit=None, directions=VIEWS, h=0.1)
     options = OPTIONS[name]
-    coded = options.storage == "adaptive"
+    coded = getattr(options, "storage", None) == "adaptive"
     stream.fit(table, options, tmp_path / "a.meso", key="k", backend="torch", silhouette=mdf)
+    other = tmp_path / "b.meso"
     if isinstance(options, EigenOptions):
-        eigen_btf.save(eigen.fit(table, options), tmp_path / "b.meso", silhouette=mdf, coded=coded)
+        eigen_btf.save(eigen.fit(table, options), other, silhouette=mdf, coded=coded)
+    elif isinstance(options, ShPcaOptions):
+        sh_pca_btf.save(sh_pca.fit(table, options), other, silhouette=mdf)
+    elif isinstance(options, FactoredOptions):
+        factored_btf.save(factored.fit(table, options), other, silhouette=mdf)
     else:
-        sh_btf.save(double_sh.fit(table, options), tmp_path / "b.meso", silhouette=mdf, coded=coded)
+        sh_btf.save(double_sh.fit(table, options), other, silhouette=mdf, coded=coded)
     (meta, streamed), (expected_meta, expected) = tensors(tmp_path / "a.meso"), tensors(tmp_path / "b.meso")
     assert meta == expected_meta
     assert list(streamed) == list(expected)
@@ -60,7 +73,7 @@ class Killed(BaseException):
 
 
 @pytest.mark.parametrize(
-    ("name", "calls"), [(n, k) for n in OPTIONS for k in ((7,) if "adaptive" in n else (1, 4, 7, 10))]
+    ("name", "calls"), [(n, k) for n in BANDS for k in ((7,) if "adaptive" in n else (1, 4, 7, 10))]
 )
 def test_a_fit_that_was_killed_goes_on(name, calls, table, tmp_path, monkeypatch):
     options = OPTIONS[name]
@@ -79,9 +92,25 @@ def test_a_fit_that_was_killed_goes_on(name, calls, table, tmp_path, monkeypatch
     stored_rows = Btf.stored_rows
     monkeypatch.setattr(Btf, "stored_rows", lambda self, a, b, *c: read.append(a) or stored_rows(self, a, b, *c))
     stream.fit(table, options, tmp_path / "a.meso", key="k", backend="torch")
-    passes = 12 if isinstance(options, EigenOptions) else 6
+    passes = 12 if isinstance(options, EigenOptions | ShPcaOptions) else 6
     again = 4 if name == "double-sh adaptive" else 0  # rows that tell what the harmonics leave out
     assert len(read) == max(0, passes - calls) + again
+    assert (tmp_path / "a.meso").read_bytes() == (tmp_path / "b.meso").read_bytes()
+
+
+def test_factors_of_passes_that_ended_are_kept(table, tmp_path, monkeypatch):
+    options = OPTIONS["factored"]
+    stream.fit(table, options, tmp_path / "b.meso", key="k")
+
+    def dies(share):
+        if share > 0.7:
+            raise Killed
+
+    with pytest.raises(Killed):
+        stream.fit(table, options, tmp_path / "a.meso", key="k", progress=dies)
+    told = []
+    stream.fit(table, options, tmp_path / "a.meso", key="k", progress=told.append)
+    assert min(told) > 0.6
     assert (tmp_path / "a.meso").read_bytes() == (tmp_path / "b.meso").read_bytes()
 
 
@@ -114,6 +143,9 @@ def test_progress_reaches_one(table, tmp_path):
 def test_bad_requests_are_refused_before_anything_is_written(table, tmp_path):
     with pytest.raises(ConfigError, match=r"compress\.rank"):
         stream.fit(table, EigenOptions(rank=16), tmp_path / "a.meso", key="k")
-    with pytest.raises(ConfigError, match="expected directions that tell 36 coefficients"):
-        stream.fit(table, DoubleShOptions(light_terms=36), tmp_path / "a.meso", key="k")
+    for options in (DoubleShOptions(light_terms=36), ShPcaOptions(light_terms=36)):
+        with pytest.raises(ConfigError, match="expected directions that tell 36 coefficients"):
+            stream.fit(table, options, tmp_path / "a.meso", key="k")
+    with pytest.raises(ConfigError, match=r"compress\.rank"):
+        stream.fit(table, FactoredOptions(rank=43), tmp_path / "a.meso", key="k")
     assert [p.name for p in tmp_path.iterdir()] == ["a.btf.zarr"]

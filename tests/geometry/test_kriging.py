@@ -51,6 +51,35 @@ def test_a_finer_set_holds_the_coarse_one(name):
     torch.testing.assert_close((table[there.node] * there.weight).sum(-1), values, rtol=0, atol=1e-9)
 
 
+def test_a_guess_is_the_mean_of_kriging_and_of_the_four_nearest(rng):
+    known = hemisphere.ubo81().directions(torch.float64)
+    asked = torch.randn(50, 3, generator=rng, dtype=torch.float64).abs()
+    asked = torch.nn.functional.normalize(asked, dim=-1)
+    found = kriging.guess(known, asked)
+    torch.testing.assert_close(found.sum(1), torch.ones(len(asked), dtype=torch.float64), **FLOAT64)
+    mean = 2 * found - kriging.weights(known, asked)
+    for row, w in zip(mean, asked, strict=True):
+        away = (known - w).norm(dim=1)
+        near = away.argsort()[:4]
+        share = away[near].clamp(min=1e-9) ** -2
+        torch.testing.assert_close(row[near], share / share.sum(), rtol=0, atol=1e-9)
+    torch.testing.assert_close(kriging.guess(known, known), torch.eye(81, dtype=torch.float64), rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["ubo81", "grid(12, 5, 80)"])
+def test_between_the_rings_the_table_is_nearer_to_the_guess_than_its_own_values(name):
+    coarse, asked = hemisphere.parse(name), hemisphere.parse("grid(97, 31, 74)")
+    fine, table = kriging.finer(coarse)
+    known, w = coarse.directions(torch.float64), asked.directions(torch.float64)
+    taps = hemisphere.interpolate(fine, w)
+    expected, share = kriging.guess(known, w), hemisphere.solid_angles(asked)[:, None]
+
+    def error(nodes):
+        return float((((nodes[taps.node] * taps.weight[..., None]).sum(1) - expected).square() * share).sum())
+
+    assert error(table) < 0.9 * error(kriging.guess(known, fine.directions(torch.float64)))
+
+
 def test_a_dense_set_stays():
     dense = hemisphere.grid(120, 10, 80)
     fine, weights = kriging.finer(dense)

@@ -288,6 +288,7 @@ MEASUREMENTS = (
     Measurement("compress.cls", constrained),
     Measurement("compress.stream", table2.streamed),
     Measurement("compress.jpeg", table2.pictures),
+    Measurement("compress.to_budget", table2.budgets),
     Measurement("compress.quantised", quantised),
     Measurement("compress.eigen", eigen),
     Measurement("compress.rate", rate),

@@ -17,11 +17,14 @@ from torch import Tensor
 
 from torchmeso.bench.extremes import Refusal
 from torchmeso.bench.suite import Context, Measurement, Row
-from torchmeso.compress import dfmf, double_sh, eigen
+from torchmeso.compress import dfmf, double_sh, double_sh_budget, eigen, eigen_budget, factored, sh_pca, transform
 from torchmeso.compress import rti as rti_fit
+from torchmeso.compress.budget import Budget
 from torchmeso.compress.dfmf import DfmfOptions
 from torchmeso.compress.double_sh import DoubleShOptions
 from torchmeso.compress.eigen import EigenOptions
+from torchmeso.compress.factored import FactoredOptions
+from torchmeso.compress.sh_pca import ShPcaOptions
 from torchmeso.data import btf, btfdbb_write
 from torchmeso.data.address import texel_centres
 from torchmeso.data.btf import Btf, Evaluable
@@ -34,6 +37,7 @@ from torchmeso.geometry.hemisphere import DirectionSet
 SET = hemisphere.grid(6, 3, 75)
 RANK = 6
 NEVER = math.inf
+HARMONICS = DoubleShOptions(light_terms=9, view_terms=4)
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -59,7 +63,12 @@ def fits() -> Iterator[Fit]:
     """Yield every table by every method."""
     methods: dict[str, Callable[[Btf], Evaluable]] = {
         "eigen": lambda t: eigen.fit(t, EigenOptions(rank=RANK)),
-        "double_sh": lambda t: double_sh.fit(t, DoubleShOptions(light_terms=9, view_terms=4)),
+        "double_sh": lambda t: double_sh.fit(t, HARMONICS),
+        "sh_pca": lambda t: sh_pca.fit(t, ShPcaOptions(rank=RANK, light_terms=9)),
+        "transform": lambda t: transform.fit(t, Budget(size=60_000))[0].expanded(),
+        "factored": lambda t: factored.opened(factored.fit(t, FactoredOptions(rank=RANK))),
+        "to_size": lambda t: eigen_budget.fit(t, Budget(size=60_000), storage="adaptive")[0],
+        "double_sh_to_size": lambda t: double_sh_budget.fit(t, Budget(size=60_000), HARMONICS)[0],
     }
     for method, fit in methods.items():
         for name, (what, images, bound) in _values().items():

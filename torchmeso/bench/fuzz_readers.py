@@ -22,11 +22,11 @@ from torchmeso.bench.fuzz import Kind, damaged_bytes
 from torchmeso.bench.suite import Context, Measurement, Row, resident_peak
 from torchmeso.compress import dfmf, double_sh, eigen, factored, transform
 from torchmeso.compress import rti as rti_fit
+from torchmeso.compress.budget import Budget
 from torchmeso.compress.dfmf import DfmfOptions
 from torchmeso.compress.double_sh import DoubleShOptions
 from torchmeso.compress.eigen import EigenOptions
 from torchmeso.compress.factored import FactoredOptions
-from torchmeso.compress.transform import TransformOptions
 from torchmeso.data import (
     btf_file,
     btfdbb_write,
@@ -170,7 +170,7 @@ def harmonics(folder: Path) -> Files:
 def streams(folder: Path) -> Files:
     """Run-time models that are decoded when opened: transform-coded, adaptive eigen and double SH, factored."""
     table = _table()
-    transform_btf.save(transform.fit(table, TransformOptions(psnr=30.0))[0], folder / "transform.meso")
+    transform_btf.save(transform.fit(table, Budget(psnr=30.0))[0], folder / "transform.meso")
     options = EigenOptions(rank=4, storage="adaptive")
     eigen_btf.save(eigen.fit(table, options), folder / "eigen.meso", coded=True)
     harmonic = double_sh.fit(table, DoubleShOptions(light_terms=4, view_terms=4, storage="adaptive"))

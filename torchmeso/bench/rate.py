@@ -108,7 +108,7 @@ def _models(
     most = DoubleShOptions(light_terms=36, view_terms=36, energy=10.0, storage="adaptive")
     harmonic, _ = double_sh_budget.fit(table, Budget(size=room), most, backend="auto")
     yield "double-sh-adaptive", _shown_harmonics(harmonic), double_sh_budget.file_size(harmonic, coded=True)
-    packed, _ = transform.fit(table, TransformOptions(size=room))
+    packed, _ = transform.fit(table, Budget(size=room))
     yield "transform", _shown_eigen(packed.expanded()), transform.size(packed)
 
 
@@ -204,7 +204,7 @@ def decoding(context: Context) -> Iterator[Row]:
         "double-sh": double_sh.fit(table, DoubleShOptions(), backend="auto"),
         "eigen4": eigen.fit(table, EigenOptions(rank=4)),
         **{
-            f"transform{rank}": transform.fit(table, TransformOptions(size=size, rank=rank))[0].expanded()
+            f"transform{rank}": transform.fit(table, Budget(size=size), TransformOptions(rank=rank))[0].expanded()
             for rank in (4, 16, 60)
         },
     }

@@ -106,6 +106,42 @@ def streamed(context: Context) -> Iterator[Row]:
                 )  # fmt: skip
 
 
+BUDGETS = {
+    "transform": ("--method", "transform", "--psnr", 32),
+    "eigen-adaptive": ("--method", "eigen", "--storage", "adaptive", "--psnr", 25),
+    "double-sh": ("--method", "double-sh", "--size", "20MB"),
+}
+"""What is asked of each method: what a repeated brick with noise in every texel can be kept to."""
+
+
+def budgets(context: Context) -> Iterator[Row]:
+    """Yield time and memory of fits to an error, from a raw table on disk to a model on disk."""
+    size = 128 if context.quick else 256
+    raw = 81 * 81 * size * size * 3
+    with _scratch() as place:
+        table = Path(place) / "raw.btf.zarr"
+        write_table(brick(size), size, table, context)
+        for name, options in BUDGETS.items():
+            context.report(f"bench budgets {size} {name}", 0)
+            drop(table)
+            out = Path(place) / "a.meso"
+            run = compress(table, out, *options)
+            share = raw / out.stat().st_size
+            out.unlink()
+            yield Row(
+                id=f"compress.to_budget.{size}.{name}",
+                what=f"{name} to {options[-2]} {options[-1]}, raw table of {size}^2 x 81 x 81 on disk to a model",
+                value=round(run.best, 2), unit="s", better="lower",
+                peer=f"wall {run.wall:.1f} s, CPU/cores {run.cpu / CORES:.1f} s; {share:.0f}:1 of {raw / 1e9:.2f} GB; "
+                f"read {run.asked / 1e9:.2f} GB, {run.from_disk / 1e9:.2f} GB of it from the disk",
+            )  # fmt: skip
+            yield Row(
+                id=f"compress.to_budget.{size}.{name}.memory",
+                what=f"largest resident memory of that fit; the values take {4 * raw / 1e9:.2f} GB",
+                value=round(run.peak / 1e9, 2), unit="GB", better="lower", goal=2.0,
+            )  # fmt: skip
+
+
 def pictures(context: Context) -> Iterator[Row]:
     """Yield the row of a folder of JPEG files: decoded once into a raw table, and fitted from there."""
     size = 128 if context.quick else 256
@@ -196,7 +232,8 @@ def write_pictures(base: Tensor, size: int, folder: Path) -> int:
 def compress(source: Path, out: Path, *options: object, cache: Path | None = None) -> Run:
     """Run `torchmeso compress` in a process of its own."""
     told = out.with_suffix(".json")
-    command = [sys.executable, "-c", CHILD, str(told), "compress", str(source), "--method", "double-sh"]
+    method = () if "--method" in options else ("--method", "double-sh")
+    command = [sys.executable, "-c", CHILD, str(told), "compress", str(source), *method]
     environment = {**os.environ, **({} if cache is None else {"TORCHMESO_CACHE": str(cache)})}
     before, start = os.times(), time.perf_counter()
     subprocess.run([*command, "--out", str(out), *map(str, options)], check=True, capture_output=True, env=environment)

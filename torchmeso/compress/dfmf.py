@@ -19,7 +19,7 @@ from torchmeso.algebra import subspace
 from torchmeso.data import bands, btfdbb_colour
 from torchmeso.data.btf import Bands
 from torchmeso.data.btfdbb_colour import Colour
-from torchmeso.data.journal import Journal
+from torchmeso.data.journal import Parts
 from torchmeso.errors import check_range
 
 DEFAULT_RANK = 64
@@ -50,7 +50,7 @@ def fit(
     table: Bands,
     options: DfmfOptions | None = None,
     *,
-    kept: Journal | None = None,
+    kept: Parts | None = None,
     progress: Progress = lambda share: None,
 ) -> Factors:
     """Return for each channel U (pair, rank) and S V (texel, rank) as `data.btfdbb_write.write_dfmf` takes them.

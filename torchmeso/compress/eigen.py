@@ -128,8 +128,16 @@ def scores(
         E = torch.zeros(W.shape[1], n_light, height, width, 3)
         for row, samples in enumerate(bands.each_row(btf, band)):
             if bool(samples.any()):
-                E[:, :, row] = (_matrix(samples) @ W).reshape(n_light, width, 3, -1).permute(3, 0, 1, 2)
+                E[:, :, row] = scores_of(samples, W)
         yield band.rows, E
+
+
+def scores_of(
+    samples: Float[Tensor, "light view W 3"], W: Float[Tensor, "view rank"]
+) -> Float[Tensor, "rank light W 3"]:
+    """Return the eigen maps of a texel row."""
+    n_light, _, width, _ = samples.shape
+    return (_matrix(samples) @ W).reshape(n_light, width, 3, -1).permute(3, 0, 1, 2)
 
 
 def _matrix(samples: Float[Tensor, "light view W 3"]) -> Float[Tensor, "row view"]:

@@ -24,6 +24,8 @@ from torchmeso.data.btf import Bands
 from torchmeso.data.btfdbb_colour import Colour
 from torchmeso.data.eigen_btf import EigenBtf
 from torchmeso.data.factored_btf import FactoredBtf
+from torchmeso.data.journal import Parts
+from torchmeso.errors import check_range
 
 COLOURS = {"rgb": Colour(0), "yuv": Colour(1), "log-y": Colour(11)}
 """Channels by name; log-y is log Y, U/Y, V/Y, which Bonn's files have."""
@@ -48,12 +50,19 @@ class FactoredOptions:
     colour: Literal["rgb", "yuv", "log-y"] = "rgb"
 
 
-def fit(btf: Bands, options: FactoredOptions | None = None, *, progress: Progress = lambda share: None) -> FactoredBtf:
+def fit(
+    btf: Bands,
+    options: FactoredOptions | None = None,
+    *,
+    kept: Parts | None = None,
+    progress: Progress = lambda share: None,
+) -> FactoredBtf:
     """Return the factored BTF of `btf`, its factors rounded to halves as files have them.
 
     Args:
         btf: in memory or on disk; read seven times.
         options: rank and colour model.
+        kept: keeps what each pass over the table gives; a run that was killed goes on from there.
         progress: called with the share done, 0..1.
 
     Raises:
@@ -64,11 +73,12 @@ def fit(btf: Bands, options: FactoredOptions | None = None, *, progress: Progres
     height, width = btf.texels
     n_light, n_view = len(btf.lights), len(btf.views)
     colour = COLOURS[options.colour]
-    chosen = DfmfOptions(rank=options.rank, colour=colour)
-    factors = dfmf.fit(btf, chosen, progress=lambda share: progress(0.8 * share))
+    chosen = check(btf, options)
+    factors = dfmf.fit(btf, chosen, kept=kept, progress=lambda share: progress(0.8 * share))
     # Rows of P are pairs, the light first; rows of S begin with the lowest row of texels.
     by_pair = torch.stack([P.unflatten(0, (n_view, n_light)).transpose(0, 1) for P, _ in factors])
     by_texel = torch.stack([S.unflatten(0, (height, width)).flip(0) for _, S in factors])
+    by_pair, by_texel = _balanced(by_pair, by_texel)
     model = FactoredBtf(
         by_pair=by_pair.half().float(), by_texel=by_texel.half().float(), colour=colour, opened_rank=n_view,
         lights=btf.lights, views=btf.views,
@@ -77,6 +87,26 @@ def fit(btf: Bands, options: FactoredOptions | None = None, *, progress: Progres
     left_out = torch.linalg.eigvalsh(total).clamp(min=0).cumsum(0).flip(0)  # by 0, 1, ... components
     needed = int((left_out > SHARE * error).sum())
     return replace(model, opened_rank=min(n_view, max(1, needed)))
+
+
+def _balanced(by_pair: Float[Tensor, "3 light view k"], by_texel: Float[Tensor, "3 H W k"]) -> tuple[Tensor, Tensor]:
+    """Return factors whose largest values are as large in both: halves end at 65,504, their products at 4e9."""
+    largest = [
+        x.abs().amax((1, 2), keepdim=True).clamp(min=torch.finfo(torch.float32).tiny) for x in (by_pair, by_texel)
+    ]
+    factor = (largest[1] / largest[0]).sqrt()
+    return by_pair * factor, by_texel / factor
+
+
+def check(btf: Bands, options: FactoredOptions) -> DfmfOptions:
+    """Return how each channel is factored.
+
+    Raises:
+        ConfigError: the rank is out of range.
+    """
+    height, width = btf.texels
+    check_range("compress.rank", options.rank, 1, min(len(btf.lights) * len(btf.views), height * width))
+    return DfmfOptions(rank=options.rank, colour=COLOURS[options.colour])
 
 
 def opened(model: FactoredBtf, rank: int | None = None) -> EigenBtf:

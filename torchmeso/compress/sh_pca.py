@@ -19,7 +19,7 @@ Test: tests/compress/test_sh_pca.py
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -30,15 +30,15 @@ from torch import Tensor
 from torchmeso.algebra import secular
 from torchmeso.algebra.gram import right_basis
 from torchmeso.algebra.spherical_harmonics import basis, degree_of, project
-from torchmeso.compress.quantize import Storage, quantize
+from torchmeso.compress.kept_maps import KeptMaps
+from torchmeso.compress.quantize import Codes, Storage, quantize
+from torchmeso.data import bands
 from torchmeso.data.btf import Bands, horizon_falloff
+from torchmeso.data.journal import InMemory, Parts
 from torchmeso.data.sh_pca_btf import Domain, ShPcaBtf
 from torchmeso.errors import ConfigError, check_range
 from torchmeso.geometry import cube_map, hemisphere, triangulation
 from torchmeso.geometry.hemisphere import DirectionSet
-
-BAND_BYTES = 128 << 20
-"""Memory of one band of texel rows."""
 
 FACE = 64
 """Texels along a face of the cube map: 25 coefficients of ubo81 lie within 1e-3 of those of a finer one."""
@@ -122,6 +122,23 @@ def _onto_cube(lights: DirectionSet, cube: cube_map.CubeMap) -> Float[Tensor, "t
     return torch.einsum("tk,tkl->tl", taps.weight, nodes[taps.node]) * falloff
 
 
+class Fitted(NamedTuple):
+    """An SH + PCA BTF in parts of a job.
+
+    Attributes:
+        maps: weights W, (view, H, W) of each component.
+        basis: (rank, coefficient, 3) b.
+    """
+
+    maps: KeptMaps
+    basis: Float[Tensor, "rank m 3"]
+
+    def component(self, k: int, storage: Storage) -> Codes:
+        """Return the codes (view, H, W) of the weights of a component, their scale and their offset."""
+        found = quantize(self.maps.collected(k)[0, ..., None, None], storage)
+        return Codes(found.codes[..., 0, 0], found.scale[0, 0], found.offset[0, 0])
+
+
 def fit(
     btf: Bands,
     options: ShPcaOptions | None = None,
@@ -142,28 +159,52 @@ def fit(
         ShapeError: a value of the BTF is not finite.
     """
     options = options or ShPcaOptions()
-    through = projection(btf.lights, options)
-    P = through.vector.float()
-    height, width = btf.texels
-    trained = _trained(btf, options, rng or torch.Generator().manual_seed(0))
-    n = 3 * options.light_terms
-    gram = torch.zeros(n, n, dtype=torch.float64)
-    for row, z in _vectors(btf, P, None if trained is None else set(trained)):
-        chosen = z if trained is None else z[trained[row]]
-        gram += (chosen.mT @ chosen).double()
-        progress(0.5 * (row + 1) / height)
-    components = right_basis((gram + gram.mT) / 2, options.rank).vectors
-    V = components.float()
-    W = torch.empty(len(btf.views), height, width, options.rank)
-    for row, z in _vectors(btf, P):
-        W[:, row] = (z @ V).unflatten(0, (-1, width))
-        progress(0.5 + 0.5 * (row + 1) / height)
-    b = torch.einsum("mn,nck->kmc", through.coefficient, components.unflatten(0, (-1, 3)))
-    codes = quantize(W.unsqueeze(-1), options.storage)
+    found = fit_parts(btf, options, InMemory(), rng=rng, progress=progress)
+    maps, scale, offset = zip(*(found.component(k, options.storage) for k in range(options.rank)), strict=True)
     return ShPcaBtf(
-        maps=codes.codes.squeeze(-1), scale=codes.scale.squeeze(-1), offset=codes.offset.squeeze(-1), basis=b.float(),
+        maps=torch.stack(maps, -1), scale=torch.stack(scale), offset=torch.stack(offset), basis=found.basis,
         lights=btf.lights, views=btf.views, domain=options.domain,
     )  # fmt: skip
+
+
+def fit_parts(
+    btf: Bands,
+    options: ShPcaOptions,
+    parts: Parts,
+    *,
+    rng: torch.Generator | None = None,
+    progress: Progress = lambda share: None,
+) -> Fitted:
+    """Return what `fit` returns, in `parts`, from where an earlier run stopped: a band is in memory at a time."""
+    through = projection(btf.lights, options)
+    P = through.vector.float()
+    n, layout = 3 * options.light_terms, bands.layout(btf)
+    trained = _trained(btf, options, rng or torch.Generator().manual_seed(0))
+    total, todo = torch.zeros(n, n, dtype=torch.float64), layout
+    for at, rows in enumerate(layout):
+        if parts.has(_gram_of(rows), (n, n), torch.float64):
+            total, todo = parts.read(_gram_of(rows), (n, n), torch.float64), layout[at + 1 :]
+    for rows, sum_so_far in _grams(btf, P, trained, todo, total):
+        total = sum_so_far
+        parts.write(_gram_of(rows), total)
+        progress(0.5 * rows.stop / btf.texels[0])
+    components = right_basis((total + total.mT) / 2, options.rank).vectors
+    maps = KeptMaps(
+        parts=parts, name="W", layout=tuple(layout), count=options.rank, before=(len(btf.views),),
+        after=(btf.texels[1],), dtype=torch.float32,
+    )  # fmt: skip
+    V, around = components.float(), (len(btf.views), btf.texels[1])
+
+    def weights(samples: Float[Tensor, "light view W 3"]) -> Float[Tensor, "rank view W"]:
+        return (_vectors(samples, P) @ V).unflatten(0, around).permute(2, 0, 1)
+
+    maps.keep_rows(btf, weights, lambda share: progress(0.5 + 0.5 * share))
+    b = torch.einsum("mn,nck->kmc", through.coefficient, components.unflatten(0, (-1, 3)))
+    return Fitted(maps, b.float())
+
+
+def _gram_of(rows: slice) -> str:
+    return f"gram.{rows.start}-{rows.stop}"
 
 
 def _trained(btf: Bands, options: ShPcaOptions, rng: torch.Generator) -> dict[int, Tensor] | None:
@@ -177,19 +218,28 @@ def _trained(btf: Bands, options: ShPcaOptions, rng: torch.Generator) -> dict[in
     return {row: places[rows == row] % each for row in rows.unique().tolist()}
 
 
-def _vectors(
-    btf: Bands, P: Float[Tensor, "n light"], asked: set[int] | None = None
-) -> Iterator[tuple[int, Float[Tensor, "_ vector"]]]:
-    """Yield the vectors (view and column, coefficient and channel) of every texel row, or of those `asked` for."""
-    height, width = btf.texels
-    row_bytes = len(btf.lights) * len(btf.views) * width * 3 * 4
-    step = max(1, min(height, BAND_BYTES // row_bytes))
-    for start in range(0, height, step):
-        rows = [r for r in range(start, min(start + step, height)) if asked is None or r in asked]
-        if not rows:
-            continue
-        band = btf.rows(rows[0], rows[-1] + 1)
-        for row in rows:
-            samples = band[:, :, row - rows[0]].flatten(1)  # (light, view column channel)
-            z = (P @ samples).unflatten(1, (-1, 3)).movedim(0, 1)
-            yield row, z.flatten(1)
+def _grams(
+    btf: Bands,
+    P: Float[Tensor, "n light"],
+    trained: dict[int, Tensor] | None,
+    wanted: Sequence[slice],
+    total: Float[Tensor, "vector vector"],
+) -> Iterator[tuple[slice, Float[Tensor, "vector vector"]]]:
+    """Yield bands of texel rows and the Gram matrix of `total` and all vectors so far that components are found from.
+
+    Of a band only the rows from the first to the last that has such vectors are read.
+    """
+    asked = [[row for row in range(b.start, b.stop) if trained is None or row in trained] for b in wanted]
+    needed = [(rows, chosen) for rows, chosen in zip(wanted, asked, strict=True) if chosen]
+    read = bands.ahead(btf, [slice(chosen[0], chosen[-1] + 1) for _, chosen in needed])
+    for (rows, chosen), band in zip(needed, read, strict=True):
+        for row in chosen:
+            z = _vectors(bands.linear_row(btf, band, row - band.rows.start), P)
+            z = z if trained is None else z[trained[row]]
+            total = total + (z.mT @ z).double()
+        yield rows, total
+
+
+def _vectors(samples: Float[Tensor, "light view W 3"], P: Float[Tensor, "n light"]) -> Float[Tensor, "_ vector"]:
+    """Return the vectors (view and column, coefficient and channel) of a texel row."""
+    return (P @ samples.flatten(1)).unflatten(1, (-1, 3)).movedim(0, 1).flatten(1)

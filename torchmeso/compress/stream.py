@@ -3,8 +3,8 @@
 Bands of texel rows are fitted as in `compress.double_sh` and `compress.eigen`, and kept in a journal beside the model
 (`data.journal`); a model needs the range of each of its maps before the first code can be written. Then one map after
 the other is collected over the bands, quantised and written. The file holds what `fit` and `save` would give, bit for
-bit. SH + PCA reads in bands too, but keeps its weights in memory and begins anew. Adaptive steps need the spread
-of all maps first: these are then collected twice, and the streams are in memory until the last one is there.
+bit. Adaptive steps need the spread of all maps first: these are then collected twice, and the streams are in memory
+until the last one is there. The factors of one decomposition per channel are in memory, and kept after every pass.
 
 Test: tests/compress/test_stream.py
 """
@@ -18,11 +18,14 @@ from torch import Tensor
 
 from torchmeso.algebra.gram import right_basis
 from torchmeso.backends import BackendChoice
-from torchmeso.compress import double_sh, eigen, quantize, sh_pca
+from torchmeso.compress import double_sh, eigen, factored, quantize, sh_pca
 from torchmeso.compress.double_sh import DoubleShOptions, quantised
 from torchmeso.compress.eigen import EigenOptions
+from torchmeso.compress.eigen_budget import kept_scores
+from torchmeso.compress.factored import FactoredOptions
+from torchmeso.compress.kept_maps import KeptMaps
 from torchmeso.compress.sh_pca import ShPcaOptions
-from torchmeso.data import bands, eigen_btf, journal, sh_btf, sh_pca_btf, store
+from torchmeso.data import bands, eigen_btf, factored_btf, journal, sh_btf, sh_pca_btf, store
 from torchmeso.data.btf import Bands
 from torchmeso.data.journal import Journal
 from torchmeso.data.mdf import Mdf
@@ -32,7 +35,7 @@ Progress = Callable[[float], None]
 
 def fit(
     btf: Bands,
-    options: EigenOptions | DoubleShOptions | ShPcaOptions,
+    options: EigenOptions | DoubleShOptions | ShPcaOptions | FactoredOptions,
     path: str | Path,
     *,
     key: str,
@@ -57,9 +60,6 @@ def fit(
         ShapeError: a value of the BTF is not finite, or a coefficient too large.
         StorageError: the disk is full, or the place cannot be written to.
     """
-    if isinstance(options, ShPcaOptions):
-        sh_pca_btf.save(sh_pca.fit(btf, options, progress=progress), path, silhouette=silhouette)
-        return
     layout = bands.layout(btf)
     job = store.content_hash(
         key, type(options).__name__, asdict(options), backend, [(rows.start, rows.stop) for rows in layout]
@@ -68,6 +68,14 @@ def fit(
         eigen.check(btf, options)
         with journal.beside(path, job) as kept:
             _fit_eigen(btf, options, layout, kept, path, silhouette, progress)
+    elif isinstance(options, ShPcaOptions):
+        sh_pca.projection(btf.lights, options)  # refuses before anything is written
+        with journal.beside(path, job) as kept:
+            _fit_sh_pca(btf, options, kept, path, silhouette, progress)
+    elif isinstance(options, FactoredOptions):
+        factored.check(btf, options)
+        with journal.beside(path, job) as kept:
+            factored_btf.save(factored.fit(btf, options, kept=kept, progress=progress), path, silhouette=silhouette)
     else:
         sides = double_sh.sides(btf, options)
         with journal.beside(path, job) as kept:
@@ -87,32 +95,21 @@ def _fit_double_sh(
 ) -> None:
     light, view = sides
     height, width = btf.texels
-
-    def shape(rows: slice) -> tuple[int, ...]:
-        return light.terms * view.terms, rows.stop - rows.start, width * 3
-
-    todo = [rows for rows in layout if not kept.has(_name("c", rows), shape(rows), torch.float16)]
-    for rows, c in double_sh.coefficients(btf, light, view, todo, backend=backend):
-        kept.write(_name("c", rows), c)
-        progress(0.8 * rows.stop / height)
+    maps = KeptMaps(
+        parts=kept, name="c", layout=tuple(layout), count=light.terms * view.terms, before=(), after=(width * 3,),
+        dtype=torch.float16,
+    )  # fmt: skip
+    fitted = double_sh.coefficients(btf, light, view, maps.todo(), backend=backend)
+    maps.keep(fitted, lambda share: progress(0.8 * share))
 
     def collected(i: int) -> Tensor:
         """Return all coefficients (i, 0), (i, 1), ..."""
-        found = torch.empty(view.terms, height, width, 3, dtype=torch.float16)
-        for rows in layout:
-            part = kept.read(_name("c", rows), shape(rows), torch.float16, first=i * view.terms, count=view.terms)
-            found[:, rows] = part.unflatten(2, (width, 3))
-        return found
-
-    def of_row(row: int) -> Tensor:
-        """Return all coefficients of a row of texels."""
-        rows = next(rows for rows in layout if row < rows.stop)
-        return kept.read(_name("c", rows), shape(rows), torch.float16)[:, row - rows.start]
+        return maps.collected(i * view.terms, view.terms).unflatten(2, (width, 3))
 
     step = None
     if options.storage == "adaptive":
         spreads = [quantize.spread(c) for i in range(light.terms) for c in collected(i)]
-        lost = double_sh.left_out(btf, light, view, of_row)
+        lost = double_sh.left_out(btf, light, view, maps.row)
         step = quantize.steps(spreads, double_sh.gain(light, view), lost).unflatten(0, (light.terms, view.terms))
 
     def coefficients(i: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -138,7 +135,7 @@ def _fit_eigen(
     progress: Progress,
 ) -> None:
     height, width = btf.texels
-    n_light, n_view = len(btf.lights), len(btf.views)
+    n_view = len(btf.views)
     square = n_view, n_view
     total, todo = torch.zeros(square, dtype=torch.float64), layout
     for at, rows in enumerate(layout):
@@ -150,29 +147,15 @@ def _fit_eigen(
         progress(0.4 * rows.stop / height)
     W = right_basis(total, options.rank).vectors.float()
 
-    def shape(rows: slice) -> tuple[int, ...]:
-        return options.rank, n_light, rows.stop - rows.start, width, 3
-
-    todo = [rows for rows in layout if not kept.has(_name("E", rows), shape(rows), torch.float32)]
-    for rows, E in eigen.scores(btf, W, todo):
-        kept.write(_name("E", rows), E)
-        progress(0.4 + 0.4 * rows.stop / height)
-
-    def collected(k: int) -> Tensor:
-        """Return one eigen map."""
-        found = torch.empty(n_light, height, width, 3)
-        for rows in layout:
-            found[:, rows] = kept.read(_name("E", rows), shape(rows), torch.float32, first=k, count=1)[0]
-        return found
-
+    maps = kept_scores(btf, W, kept, "E", lambda share: progress(0.4 + 0.4 * share))
     step = None
     if options.storage == "adaptive":
-        spreads = (quantize.spread(collected(k)) for k in range(options.rank))
+        spreads = (quantize.spread(maps.collected(k)[0]) for k in range(options.rank))
         step = eigen.adaptive_steps(btf, options.rank, total, spreads)
 
     def component(k: int) -> tuple[Tensor, Tensor, Tensor]:
         """Return codes, scale and offset of one eigen map."""
-        found = collected(k)[..., None, :]
+        found = maps.collected(k)[0][..., None, :]
         codes = quantize.quantize(found, options.storage, None if step is None else step[k, None])
         progress(0.8 + 0.2 * (k + 1) / options.rank)
         return codes.codes[..., 0, :], codes.scale[0], codes.offset[0]
@@ -180,6 +163,23 @@ def _fit_eigen(
     eigen_btf.write(
         path, component, weights=W, texels=(height, width), dtype=quantize.dtype_of(options.storage),
         lights=btf.lights, views=btf.views, silhouette=silhouette, coded=options.storage == "adaptive",
+    )  # fmt: skip
+
+
+def _fit_sh_pca(
+    btf: Bands, options: ShPcaOptions, kept: Journal, path: str | Path, silhouette: Mdf | None, progress: Progress
+) -> None:
+    found = sh_pca.fit_parts(btf, options, kept, progress=lambda share: progress(0.8 * share))
+
+    def component(k: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Return codes, scale and offset of the weights of one component."""
+        codes = found.component(k, options.storage)
+        progress(0.8 + 0.2 * (k + 1) / options.rank)
+        return codes
+
+    sh_pca_btf.write(
+        path, component, basis=found.basis, texels=btf.texels, dtype=quantize.dtype_of(options.storage),
+        lights=btf.lights, views=btf.views, domain=options.domain, silhouette=silhouette,
     )  # fmt: skip
 
 

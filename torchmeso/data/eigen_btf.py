@@ -216,6 +216,7 @@ def write(
     views: DirectionSet,
     silhouette: Mdf | None = None,
     coded: bool = False,
+    **meta: object,
 ) -> None:
     """Write a run-time model (.meso) as `save` does, one component at a time.
 
@@ -229,13 +230,14 @@ def write(
         views: directions towards the viewer.
         silhouette: the material's MDF.
         coded: whether codes are streams, which are kept in memory until all are there.
+        meta: what else the file says about itself.
 
     Raises:
         StorageError: the disk is full, or the place cannot be written to.
     """
     rank = weights.shape[1]
     depth: dict[str, Tensor] = {}
-    parts = _meta(lights, views, rank, texels if coded else None, {})
+    parts = _meta(lights, views, rank, texels if coded else None, meta)
     if silhouette is not None:
         depth, parts["mdf"] = mdf.to_tensors(silhouette)
     if coded:

@@ -1,7 +1,8 @@
 """Parts of a long job, kept beside the file it makes: the same job goes on from them after it was stopped or killed.
 
 `<file>.part` is a folder with one file of plain numbers for each part, written beside and renamed, and `key`, which
-says whose they are; another job throws them away. They are gone when the job is done.
+says whose they are; another job throws them away. They are gone when the job is done. A job that makes no file keeps
+its parts `InMemory`, by the same calls.
 
 Test: tests/data/test_journal.py
 """
@@ -11,8 +12,9 @@ import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -20,6 +22,54 @@ from torch import Tensor
 
 from torchmeso.data import store
 from torchmeso.errors import FormatError
+
+
+class Parts(Protocol):
+    """Parts of a job by name: a `Journal`, or `InMemory`."""
+
+    def has(self, name: str, shape: tuple[int, ...], dtype: torch.dtype) -> bool:
+        """Return whether the part `name` is there."""
+        ...
+
+    def write(self, name: str, values: Tensor) -> None:
+        """Keep a part, in the place of one that has its name."""
+        ...
+
+    def read(
+        self, name: str, shape: tuple[int, ...], dtype: torch.dtype, *, first: int = 0, count: int | None = None
+    ) -> Tensor:
+        """Return a part, or the `count` from `first` on along its first axis."""
+        ...
+
+    def drop(self, name: str) -> None:
+        """Forget a part, where there is one."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class InMemory:
+    """Parts of a job that are gone with it."""
+
+    parts: dict[str, Tensor] = field(default_factory=dict)
+
+    def has(self, name: str, shape: tuple[int, ...], dtype: torch.dtype) -> bool:
+        """Return whether the part `name` is there."""
+        return name in self.parts and (tuple(self.parts[name].shape), self.parts[name].dtype) == (shape, dtype)
+
+    def write(self, name: str, values: Tensor) -> None:
+        """Keep a part."""
+        self.parts[name] = values
+
+    def read(
+        self, name: str, shape: tuple[int, ...], dtype: torch.dtype, *, first: int = 0, count: int | None = None
+    ) -> Tensor:
+        """Return a part, or the `count` from `first` on along its first axis."""
+        assert self.has(name, shape, dtype), name
+        return self.parts[name][first : None if count is None else first + count]
+
+    def drop(self, name: str) -> None:
+        """Forget a part."""
+        self.parts.pop(name, None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +110,10 @@ class Journal:
         if len(found) != count * inner:
             raise FormatError(f"{self.folder / name}: expected {count * inner} numbers, got {len(found)}; remove it")
         return torch.from_numpy(found).reshape(count, *shape[1:])
+
+    def drop(self, name: str) -> None:
+        """Forget a part: it is needed no more, and takes room."""
+        (self.folder / name).unlink(missing_ok=True)
 
 
 @contextmanager

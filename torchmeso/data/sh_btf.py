@@ -228,6 +228,7 @@ def write(
     views: DirectionSet,
     silhouette: Mdf | None = None,
     coded: bool = False,
+    **meta: object,
 ) -> None:
     """Write a run-time model (.meso) as `save` does, one coefficient of the light at a time.
 
@@ -241,11 +242,12 @@ def write(
         views: directions towards the viewer.
         silhouette: the material's MDF.
         coded: whether codes are streams, which are kept in memory until all are there.
+        meta: what else the file says about itself.
 
     Raises:
         StorageError: the disk is full, or the place cannot be written to.
     """
-    parts = _meta(lights, views, terms, texels if coded else None, {})
+    parts = _meta(lights, views, terms, texels if coded else None, meta)
     depth: dict[str, Tensor] = {}
     if silhouette is not None:
         depth, parts["mdf"] = mdf.to_tensors(silhouette)

@@ -13,6 +13,7 @@ cos(theta_i) / cos(last) there: as for every BTF of this package, and C0 at the 
 Kernel: kernels_cl/data/sh_pca_btf.clh          Test: tests/data/test_sh_pca_btf.py
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -23,7 +24,7 @@ from jaxtyping import Float, Shaped
 from torch import Tensor
 
 from torchmeso.algebra.spherical_harmonics import degree_of
-from torchmeso.data import address, mdf, pyramid, store
+from torchmeso.data import address, mdf, model_writer, pyramid, store
 from torchmeso.data.btf import horizon_falloff
 from torchmeso.data.mdf import Mdf
 from torchmeso.data.pyramid import Footprint
@@ -180,15 +181,69 @@ def save(model: ShPcaBtf, path: str | Path, *, silhouette: Mdf | None = None, **
     """Write a run-time model (.meso): one tensor per component, and the material's MDF where it has one."""
     tensors = {f"sh_pca.map.{k}": model.maps[..., k] for k in range(model.rank)}
     tensors |= {"sh_pca.scale": model.scale, "sh_pca.offset": model.offset, "sh_pca.basis": model.basis}
-    about: dict[str, object] = {
-        "lights": model.lights.name, "views": model.views.name, "rank": model.rank, "terms": model.terms,
-        "domain": model.domain,
-    }  # fmt: skip
-    parts: dict[str, object] = {"kind": "sh-pca", "sh_pca": about, **meta}
+    parts = _meta(model.lights, model.views, model.rank, model.terms, model.domain, meta)
     if silhouette is not None:
         mdf_tensors, parts["mdf"] = mdf.to_tensors(silhouette)
         tensors |= mdf_tensors
     store.write_model(path, tensors, parts)
+
+
+def write(
+    path: str | Path,
+    component: Callable[[int], tuple[Tensor, Tensor, Tensor]],
+    *,
+    basis: Float[Tensor, "rank m 3"],
+    texels: tuple[int, int],
+    dtype: torch.dtype,
+    lights: DirectionSet,
+    views: DirectionSet,
+    domain: Domain,
+    silhouette: Mdf | None = None,
+    **meta: object,
+) -> None:
+    """Write a run-time model (.meso) as `save` does, one component at a time.
+
+    Args:
+        path: of the model.
+        component: called with k = 0, 1, ...; returns codes (view, H, W), scale () and offset ().
+        basis: b.
+        texels: height and width.
+        dtype: of the codes.
+        lights: directions towards the light.
+        views: directions towards the viewer.
+        domain: of the coefficients.
+        silhouette: the material's MDF.
+        meta: what else the file says about itself.
+
+    Raises:
+        StorageError: the disk is full, or the place cannot be written to.
+    """
+    rank, terms, _ = basis.shape
+    parts = _meta(lights, views, rank, terms, domain, meta)
+    whole = {"sh_pca.basis": basis}
+    if silhouette is not None:
+        depth, parts["mdf"] = mdf.to_tensors(silhouette)
+        whole |= depth
+    layout: dict[str, tuple[torch.dtype, tuple[int, ...]]] = {
+        f"sh_pca.map.{k}": (dtype, (len(views), *texels)) for k in range(rank)
+    }
+    layout |= dict.fromkeys(("sh_pca.scale", "sh_pca.offset"), (torch.float32, (rank,)))
+    layout |= {name: (x.dtype, tuple(x.shape)) for name, x in whole.items()}
+    with model_writer.in_parts(path, layout, parts) as put:
+        for k in range(rank):
+            codes, scale, offset = component(k)
+            put(f"sh_pca.map.{k}", codes, 0)
+            put("sh_pca.scale", scale.reshape(1), k)
+            put("sh_pca.offset", offset.reshape(1), k)
+        for name, x in whole.items():
+            put(name, x, 0)
+
+
+def _meta(
+    lights: DirectionSet, views: DirectionSet, rank: int, terms: int, domain: Domain, more: dict[str, object]
+) -> dict[str, object]:
+    about = {"lights": lights.name, "views": views.name, "rank": rank, "terms": terms, "domain": domain}
+    return {"kind": "sh-pca", "sh_pca": about, **more}
 
 
 def load(path: str | Path, *, rank: int | None = None) -> ShPcaBtf:

@@ -10,12 +10,13 @@ Test: tests/data/test_transform_btf.py
 """
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int16
+from jaxtyping import Float, Int16, UInt8
 from torch import Tensor
 
 from torchmeso.data import code_stream, mdf, store
@@ -67,15 +68,9 @@ class TransformBtf:
 
     def expanded(self) -> EigenBtf:
         """Return the same BTF as eigen maps of eight bits, component by component: what pictures are made from."""
-        maps, scale, offset = [], [], []
-        for codes in self.codes:
-            terms = cosines(codes.float() * self.step, inverse=True)
-            E = torch.einsum("jchw,lj,rc->lhwr", terms, self.light_basis.float(), self.colour_basis.float())
-            low, high = E.amin((0, 1, 2)), E.amax((0, 1, 2))
-            step = ((high - low) / 255).clamp(min=torch.finfo(torch.float32).tiny)
-            maps.append(((E - low) / step).round_().clamp_(0, 255).to(torch.uint8))
-            scale.append(step)
-            offset.append(low)
+        maps, scale, offset = zip(
+            *(opened(codes, self.step, self.light_basis, self.colour_basis) for codes in self.codes), strict=True
+        )
         return EigenBtf(
             maps=torch.stack(maps, -2),
             weights=self.view_basis.float(),
@@ -86,12 +81,28 @@ class TransformBtf:
         )
 
 
-def cosines(x: Float[Tensor, "*batch H W"], *, inverse: bool = False) -> Float[Tensor, "*batch H W"]:
+def opened(
+    codes: Int16[Tensor, "term 3 H W"],
+    step: float,
+    light_basis: Float[Tensor, "light term"],
+    colour_basis: Float[Tensor, "3 3"],
+) -> tuple[UInt8[Tensor, "light H W 3"], Float[Tensor, "3"], Float[Tensor, "3"]]:
+    """Return the eigen map of one component in eight bits: codes, scale and offset."""
+    terms = cosines(codes.float() * step, inverse=True)
+    E = torch.einsum("jchw,lj,rc->lhwr", terms, light_basis.float(), colour_basis.float())
+    low, high = E.amin((0, 1, 2)), E.amax((0, 1, 2))
+    scale = ((high - low) / 255).clamp(min=torch.finfo(torch.float32).tiny)
+    return ((E - low) / scale).round_().clamp_(0, 255).to(torch.uint8), scale, low
+
+
+def cosines(
+    x: Float[Tensor, "*batch H W"], *, inverse: bool = False, along: tuple[int, ...] = (-2, -1)
+) -> Float[Tensor, "*batch H W"]:
     """Return the orthonormal cosine transform (DCT-II) of blocks of texels, in the place of their texels.
 
-    Blocks are as large as divides the texture, up to `LARGEST_BLOCK`.
+    Blocks are as large as divides the texture, up to `LARGEST_BLOCK`; `along` its columns (-2), its rows (-1) or both.
     """
-    for dim in (-2, -1):
+    for dim in along:
         n = x.shape[dim]
         side = max(b for b in range(1, min(n, LARGEST_BLOCK) + 1) if n % b == 0)
         k, place = torch.arange(side, dtype=torch.float64)[:, None], torch.arange(side, dtype=torch.float64) + 0.5
@@ -105,8 +116,8 @@ def cosines(x: Float[Tensor, "*batch H W"], *, inverse: bool = False) -> Float[T
 
 def packed(codes: Int16[Tensor, "term 3 H W"]) -> bytes:
     """Return the stream of one component: 0, -1, 1, -2, ... as 0, 1, 2, 3, ..., low bytes, then high ones."""
-    q = codes.numpy().astype(np.int32).ravel()
-    folded = np.where(q < 0, -2 * q - 1, 2 * q).astype("<u2").view(np.uint8)
+    q = codes.numpy().ravel()
+    folded = ((q << 1) ^ (q >> 15)).astype("<i2").view(np.uint8)
     planes = np.ascontiguousarray(folded.reshape(-1, 2).T)
     return code_stream.squeezed(planes.tobytes())
 
@@ -128,18 +139,39 @@ def unpacked(stream: bytes, shape: tuple[int, int, int, int]) -> Int16[Tensor, "
 
 def save(packed_btf: TransformBtf, path: str | Path, *, silhouette: Mdf | None = None, **meta: object) -> None:
     """Write a run-time model (.meso): one stream per component, bases in halves, and the MDF where there is one."""
-    tensors = {f"transform.view.{k}": _bytes(packed(codes)) for k, codes in enumerate(packed_btf.codes)}
-    for name in ("light_basis", "view_basis", "colour_basis"):
-        tensors[f"transform.{name}"] = getattr(packed_btf, name).half()
-    rank, terms, _, height, width = packed_btf.codes.shape
+    write(
+        path, (packed(codes) for codes in packed_btf.codes), texels=tuple(packed_btf.codes.shape[3:]),
+        light_basis=packed_btf.light_basis, view_basis=packed_btf.view_basis, colour_basis=packed_btf.colour_basis,
+        step=packed_btf.step, lights=packed_btf.lights, views=packed_btf.views, silhouette=silhouette, **meta,
+    )  # fmt: skip
+
+
+def write(
+    path: str | Path,
+    streams: Iterable[bytes],
+    *,
+    texels: tuple[int, ...],
+    light_basis: Float[Tensor, "light term"],
+    view_basis: Float[Tensor, "view rank"],
+    colour_basis: Float[Tensor, "3 3"],
+    step: float,
+    lights: DirectionSet,
+    views: DirectionSet,
+    silhouette: Mdf | None = None,
+    **meta: object,
+) -> None:
+    """Write a run-time model (.meso) as `save` does, of the streams of its components; only these are in memory.
+
+    Raises:
+        StorageError: the disk is full, or the place cannot be written to.
+    """
+    tensors = {f"transform.view.{k}": _bytes(stream) for k, stream in enumerate(streams)}
+    for name, basis in (("light", light_basis), ("view", view_basis), ("colour", colour_basis)):
+        tensors[f"transform.{name}_basis"] = basis.half()
     about: dict[str, object] = {
-        "lights": packed_btf.lights.name,
-        "views": packed_btf.views.name,
-        "rank": rank,
-        "light_terms": terms,
-        "texels": [height, width],
-        "step": packed_btf.step,
-    }
+        "lights": lights.name, "views": views.name, "rank": view_basis.shape[1], "light_terms": light_basis.shape[1],
+        "texels": list(texels), "step": step,
+    }  # fmt: skip
     parts: dict[str, object] = {"kind": "transform", "transform": about, **meta}
     if silhouette is not None:
         mdf_tensors, parts["mdf"] = mdf.to_tensors(silhouette)

@@ -8,10 +8,11 @@ kriging whose variogram is linear, the best guess for values that differ by as m
 is linear in the values, exact at what is known, gives constants back, and needs no triangulation, no count of
 neighbours and no exponent. Smoother kernels (thin plates, cubes) win on smooth materials and overshoot on others; this
 one is nearer to held-out pictures than nearest, inverse-distance and barycentric interpolation, but for views of brick,
-where it is level with the best of them (rows `compress.held_out`).
+where parallax leaves nothing better than a mean of neighbours and it is level with the best of them. For view weights
+`guess` is therefore half of it and half such a mean (rows `compress.held_out`).
 
-Renderers cannot solve for every pixel. `finer` tabulates the function once on rings twice as dense, between which
-linear interpolation (`geometry.hemisphere`) is as near: a few more kilobytes for what has no texels.
+Renderers cannot solve for every pixel. `finer` tabulates the guess once on rings twice as dense, so that linear
+interpolation (`geometry.hemisphere`) is nearest to it: a few more kilobytes for what has no texels.
 
 Test: tests/geometry/test_kriging.py
 """
@@ -26,8 +27,11 @@ from torch import Tensor
 from torchmeso.geometry import hemisphere
 from torchmeso.geometry.hemisphere import DirectionSet
 
-DENSE = 1024
+DENSE = 512
 """Directions of a set that is fine enough as it is."""
+
+NEAREST = 4
+"""Directions that are averaged by their distance."""
 
 
 def weights(known: Float[Tensor, "known 3"], asked: Float[Tensor, "asked 3"]) -> Float[Tensor, "asked known"]:
@@ -53,18 +57,45 @@ def weights(known: Float[Tensor, "known 3"], asked: Float[Tensor, "asked 3"]) ->
 def finer(directions: DirectionSet) -> tuple[DirectionSet, Float[Tensor, "node direction"]]:
     """Return a set of twice the rings and azimuths that has all of `directions`, the pole too, and the weights to it.
 
-    weights @ table is the table on the finer set, float64: exact where the directions are, least rough between. A set
-    of more than `DENSE` directions is returned as it is.
+    weights @ table is the table on the finer set, float64: exact where the directions are, and elsewhere such that
+    linear interpolation of it is nearest to `guess` (least squares over the hemisphere). A set of more than `DENSE`
+    directions is returned as it is.
     """
     if len(directions) > DENSE:
         return directions, torch.eye(len(directions), dtype=torch.float64)
+    fine = _doubled(directions)
+    between = _doubled(fine)
+    known, nodes, asked = (x.directions(torch.float64) for x in (directions, fine, between))
+    found = guess(known, nodes)
+    free = torch.cdist(nodes, known, compute_mode="donot_use_mm_for_euclid_dist").amin(1) > 1e-9
+    taps = hemisphere.interpolate(fine, asked)
+    hats = torch.zeros(len(asked), len(nodes), dtype=torch.float64).scatter_add_(1, taps.node, taps.weight)
+    share = hemisphere.solid_angles(between)[:, None] * hats[:, free]
+    rest = guess(known, asked) - hats[:, ~free] @ found[~free]
+    found[free] = torch.linalg.solve(share.mT @ hats[:, free], share.mT @ rest)
+    return fine, found
+
+
+def guess(known: Float[Tensor, "known 3"], asked: Float[Tensor, "asked 3"]) -> Float[Tensor, "asked known"]:
+    """Return float64 weights of the mean of two guesses: kriging, and inverse squared distances of the four nearest.
+
+    Their errors are not the same: the first follows what changes slowly, the second averages what does not.
+    """
+    away = torch.cdist(asked.double(), known.double(), compute_mode="donot_use_mm_for_euclid_dist").clamp(min=1e-9)
+    away, near = away.topk(min(NEAREST, len(known)), largest=False)
+    share = (away[:, :1] / away).square()
+    mean = torch.zeros(len(asked), len(known), dtype=torch.float64)
+    mean.scatter_(1, near, share / share.sum(1, keepdim=True))
+    return (weights(known, asked) + mean) / 2
+
+
+def _doubled(directions: DirectionSet) -> DirectionSet:
     rings = list(zip(directions.theta_deg, directions.count, directions.phi0_deg, strict=True))
     if directions.needs_pole:
         rings = [(0.0, 1, 0.0), *rings]
     between = [((a + b) / 2, 2 * max(m, n), phi0) for (a, m, _), (b, n, phi0) in pairwise(rings)]
     doubled = [(theta, 2 * n if theta else 1, phi0) for theta, n, phi0 in rings]
-    fine = hemisphere.from_rings(*zip(*sorted(doubled + between), strict=True))
-    return fine, weights(*(x.directions(torch.float64) for x in (directions, fine)))
+    return hemisphere.from_rings(*zip(*sorted(doubled + between), strict=True))
 
 
 def _parabolic(w: Tensor) -> Tensor:
