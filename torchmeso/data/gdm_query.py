@@ -39,8 +39,8 @@ class Query(NamedTuple):
 
 
 @runtime_checkable
-class Sampled(Protocol):
-    """Samples over voxels and directions: `data.gdm.Gdm`, or `data.gdm_svd.GdmSvd`."""
+class Slab(Protocol):
+    """What rays run through."""
 
     @property
     def h(self) -> float:
@@ -51,6 +51,20 @@ class Sampled(Protocol):
     def cap(self) -> float:
         """Longest distance, tile units."""
         ...
+
+
+@runtime_checkable
+class Voxels(Protocol):
+    """A number for each voxel: a tensor, or what can be asked as one."""
+
+    def __getitem__(self, voxel: Int[Tensor, "*batch"], /) -> Float[Tensor, "*batch"]:
+        """Return the numbers of voxels."""
+        ...
+
+
+@runtime_checkable
+class Sampled(Slab, Protocol):
+    """Samples over voxels and directions: `data.gdm.Gdm`, or `data.gdm_svd.GdmSvd`."""
 
     @property
     def voxels(self) -> tuple[int, int, int]:
@@ -63,7 +77,7 @@ class Sampled(Protocol):
         ...
 
     @property
-    def solid(self) -> Float[Tensor, "voxel"]:
+    def solid(self) -> Voxels:
         """1 where a voxel is inside of material."""
         ...
 
@@ -159,7 +173,7 @@ def voxel_side(table: Sampled) -> float:
     return max(1 / width, 1 / height, table.h / (layers - 1))
 
 
-def boundary(table: Sampled, place: Float[Tensor, "*batch 3"], w: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+def boundary(table: Slab, place: Float[Tensor, "*batch 3"], w: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
     """Return the way along `w` to the top or bottom of the slab, at most `cap`."""
     z = place[..., 2].clamp(-table.h, 0)
     climb = w[..., 2]
