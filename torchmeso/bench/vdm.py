@@ -132,7 +132,7 @@ class Vdm:
 
 
 def bent(
-    tau: Float[Tensor, "*batch"], cosine: Float[Tensor, "*batch"], c: Float[Tensor, "*batch"]
+    tau: Float[Tensor, "*#batch"], cosine: Float[Tensor, "*#batch"], c: Float[Tensor, "*#batch"]
 ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
     """Return arc and height, tile units, of a ray after the way `tau`; `cosine` is that to the normal, > 0."""
     sine = (1 - cosine.square()).clamp(min=0).sqrt()
@@ -145,7 +145,7 @@ def bent(
 
 
 def through(
-    h: float, cosine: Float[Tensor, "*batch"], c: Float[Tensor, "*batch"]
+    h: float, cosine: Float[Tensor, "*#batch"], c: Float[Tensor, "*#batch"]
 ) -> tuple[Float[Tensor, "*batch"], Bool[Tensor, "*batch"]]:
     """Return the way of a ray through the slab, and whether it comes out of the top again instead of the bottom."""
     drop = c * (2 * h - c * h * h)

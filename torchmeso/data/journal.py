@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -24,6 +24,7 @@ from torchmeso.data import store
 from torchmeso.errors import FormatError
 
 
+@runtime_checkable
 class Parts(Protocol):
     """Parts of a job by name: a `Journal`, or `InMemory`."""
 

@@ -59,7 +59,7 @@ class Cut(NamedTuple):
     cost: Int[Tensor, "B"]
 
 
-def differences(a: Int[Tensor, "*batch C"], b: Int[Tensor, "*batch C"]) -> Int[Tensor, "*batch"]:
+def differences(a: Int[Tensor, "*#batch C"], b: Int[Tensor, "*#batch C"]) -> Int[Tensor, "*pair"]:
     """Return e of two sides, in 1 / `STEPS` of a step of their codes."""
     return (STEPS * (a - b).square().sum(-1).double().sqrt()).round().long().clamp(max=MOST)
 
