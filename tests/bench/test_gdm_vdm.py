@@ -1,3 +1,4 @@
+import pytest
 import torch
 
 from torchmeso.bench import gdm_vdm
@@ -15,6 +16,7 @@ def test_the_surfaces_of_the_paper():
     assert radius[neck].max() < 0.5 * radius[belly].max()
 
 
+@pytest.mark.slow
 def test_depths_that_are_true_are_judged_so():
     mesh, camera = gdm_vdm.undulating(200), view(gdm_vdm.EYES["undulating"])
     truth = gdm_vdm.true_depth(mesh, camera)

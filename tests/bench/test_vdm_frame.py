@@ -40,6 +40,7 @@ def test_the_kernel_shows_what_the_formula_says(weave, device, name):
     assert (frames.rgb[~seen] == 0).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "bound"), [("plane", 0.02), ("torus", 0.06)])
 def test_a_frame_is_close_to_the_displaced_mesh(weave, name, bound):
     """Distances beside rays at the same weave as triangles: exact on a plane but for the table's size."""

@@ -29,6 +29,9 @@ JOBS = {
     "transform, a size": (TransformOptions(rank=12), Budget(size=9_000)),
 }
 
+QUICK = ("eigen, an error", "eigen adaptive, a size", "double-sh, an error", "transform, a size")
+EACH = [pytest.param(name, marks=[] if name in QUICK else pytest.mark.slow) for name in JOBS]
+
 
 @pytest.fixture
 def table(rng, tmp_path):
@@ -66,8 +69,15 @@ def fit(table, name, path, **more):
     return budget_stream.fit(table, options, wanted, path, key="k", backend="torch", **more)
 
 
-@pytest.mark.parametrize("name", JOBS)
-@pytest.mark.parametrize("room", [1, 3 * 18 * 15 * 8 * 12, 1 << 28], ids=["a row", "three rows", "all"])
+@pytest.mark.parametrize("name", EACH)
+@pytest.mark.parametrize(
+    "room",
+    [
+        pytest.param(1, id="a row"),
+        pytest.param(3 * 18 * 15 * 8 * 12, id="three rows", marks=pytest.mark.slow),
+        pytest.param(1 << 28, id="all"),
+    ],
+)
 def test_the_file_is_the_one_of_a_fit_in_memory(name, room, table, tmp_path, monkeypatch):
     expected = in_memory(table, *JOBS[name], tmp_path / "b.meso")
     monkeypatch.setattr(bands, "ROOM", room)
@@ -86,7 +96,7 @@ class Killed(BaseException):
     """As if the process were gone."""
 
 
-@pytest.mark.parametrize("name", JOBS)
+@pytest.mark.parametrize("name", EACH)
 def test_a_search_that_was_killed_goes_on(name, table, tmp_path, monkeypatch):
     monkeypatch.setattr(bands, "ROOM", 1)
     reads, told = [], []
@@ -122,7 +132,7 @@ def test_a_search_that_was_killed_goes_on(name, table, tmp_path, monkeypatch):
         (tmp_path / "a.meso").unlink()
 
 
-@pytest.mark.parametrize("name", JOBS)
+@pytest.mark.parametrize("name", EACH)
 def test_rows_and_maps_alone_are_in_memory(name, table, tmp_path, monkeypatch):
     """What is read, kept or collected at a time is a row of texels or a map, whatever the size of the texture."""
     monkeypatch.setattr(bands, "ROOM", 1)
