@@ -33,6 +33,7 @@ def reduced(settings):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*unwrapped into")
+@pytest.mark.filterwarnings("ignore:truth. a normal map has no geometry")
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda p: p.stem)
 def test_start_to_picture(path):
     if "data:" in path.read_text() and not config.data_dir().is_dir():
