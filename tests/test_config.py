@@ -5,7 +5,8 @@ import torch
 import yaml
 
 from torchmeso import config
-from torchmeso.config import CameraConfig, ObjectConfig, load, parse
+from torchmeso.config import load, parse
+from torchmeso.config_sections import CameraConfig, ObjectConfig
 from torchmeso.errors import ConfigError, FormatError, MesoError
 from torchmeso.geometry.light import DirectionalLight, PointLight, SpotLight
 from torchmeso.geometry.mesh_file import Finish

@@ -1,371 +1,44 @@
 """Configurations: a YAML file -> what every stage is asked to do.
 
 A file names materials (a mesostructure and how to bake and compress it, a finished model, or a plain colour),
-objects, lights, a camera and how to render. The stages' own options are used as they are; unknown keys are refused and
-the nearest known one is named. Paths that start with `data:` lie in TORCHMESO_DATA, others beside the file.
+objects, lights, a camera and how to render (`config_sections`). Of unknown keys the nearest known one is named. Paths
+that start with `data:` lie in TORCHMESO_DATA, others beside the file.
 
 Test: tests/test_config.py
 """
 
 import inspect
 import os
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
-import torch
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator, validate_call
+from pydantic import BaseModel, ValidationError
 
-from torchmeso.backends import BackendChoice
 from torchmeso.compress.double_sh import DoubleShOptions
 from torchmeso.compress.eigen import EigenOptions
 from torchmeso.compress.sh_pca import ShPcaOptions
-from torchmeso.errors import ConfigError, FormatError, MesoError, did_you_mean
-from torchmeso.geometry.camera import Camera, look_at
-from torchmeso.geometry.light import DirectionalLight, Light, PointLight, SpotLight
-from torchmeso.geometry.mesh import Mesh
-from torchmeso.geometry.mesh_file import Finish
-from torchmeso.geometry.shapes import SHAPES
+from torchmeso.config_sections import (
+    CameraConfig,
+    Config,
+    MaterialConfig,
+    MesoConfig,
+    ObjectConfig,
+    PlaceConfig,
+    RegionConfig,
+    SpotConfig,
+    TruthConfig,
+    first_problem,
+)
+from torchmeso.errors import ConfigError, FormatError
 from torchmeso.geometry.unwrap import UnwrapOptions
 from torchmeso.meso.bake_btf import BtfOptions
-from torchmeso.meso.bake_gdm import GdmOptions
 from torchmeso.meso.bake_mdf import MdfOptions
-from torchmeso.meso.mesostructure import Mesostructure, Rgb
-from torchmeso.meso.sources import SOURCES, SUFFIXES
+from torchmeso.meso.mesostructure import Mesostructure
+from torchmeso.meso.sources import SUFFIXES
 from torchmeso.render.frame import FrameOptions
-from torchmeso.render.scene import ShellOptions
 from torchmeso.render.silhouette import Silhouette
-
-Vector = tuple[float, float, float]
-
-
-class _Strict(BaseModel):
-    """Frozen, and nothing but the known keys."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True, allow_inf_nan=False)
-
-
-class MesoConfig(BaseModel):
-    """A mesostructure: `type`, and the arguments of that generator or reader."""
-
-    model_config = ConfigDict(extra="allow", frozen=True)
-
-    type: str
-
-    @model_validator(mode="after")
-    def _check(self) -> "MesoConfig":
-        if self.type not in SOURCES:
-            raise ValueError(f"expected a mesostructure, got '{self.type}'{did_you_mean(self.type, SOURCES)}")
-        parameters = inspect.signature(SOURCES[self.type]).parameters
-        for key in self.arguments:
-            if key not in parameters:
-                raise ValueError(f"{self.type} has no option '{key}'{did_you_mean(key, parameters)}")
-        for name, parameter in parameters.items():
-            if parameter.default is inspect.Parameter.empty and name not in self.arguments:
-                raise ValueError(f"{self.type} needs the option '{name}'")
-        return self
-
-    @property
-    def arguments(self) -> dict[str, Any]:
-        """Options of the generator or reader."""
-        return dict(self.model_extra or {})
-
-    @property
-    def files(self) -> list[Path]:
-        """Files it is made from."""
-        return [Path(v) for k, v in self.arguments.items() if k in ("displacement", "albedo", "path") and _is_path(v)]
-
-    def build(self) -> Mesostructure:
-        """Return the mesostructure.
-
-        Raises:
-            MesoError: an argument is out of range, or a file is missing or unreadable.
-        """
-        return _call("meso", SOURCES[self.type], self.arguments)
-
-
-GDMS = (".gdm.zarr", ".gdm.meso")
-"""How files end that hold a GDM."""
-
-
-class MaterialConfig(_Strict):
-    """A mesostructure with how to bake and compress it; or a finished model; or a plain colour with pictures.
-
-    A BTF becomes an eigen BTF, or a double-SH BTF where `double_sh` is given, or an SH + PCA BTF where `sh_pca` is.
-    `rank` reads only that many components of a model; the others stay on disk. `albedo` multiplies `albedo_map`.
-    With `gdm` the mesostructure stands as material of any form in a `shell` instead, above a `floor` of that colour; a
-    `model` may be a GDM too, as baked (.gdm.zarr) or compressed (.gdm.meso). `quilting` is a map (.quilt) that lays
-    out BTF, MDF and pictures; texture coordinates stay those of the exemplar.
-    """
-
-    meso: MesoConfig | None = None
-    model: str | None = None
-    rank: int | None = Field(default=None, ge=1)
-    albedo: Rgb | None = None
-    albedo_map: str | None = None
-    normal_map: str | None = None
-    normal_scale: float = 1.0
-    btf: BtfOptions = Field(default_factory=BtfOptions)
-    mdf: MdfOptions = Field(default_factory=MdfOptions)
-    eigen: EigenOptions = Field(default_factory=EigenOptions)
-    double_sh: DoubleShOptions | None = None
-    sh_pca: ShPcaOptions | None = None
-    gdm: GdmOptions | None = None
-    shell: ShellOptions = Field(default_factory=ShellOptions)
-    floor: Rgb = (0.6, 0.6, 0.6)
-    quilting: str | None = None
-
-    @model_validator(mode="after")
-    def _check(self) -> "MaterialConfig":
-        plain = self.albedo is not None or self.albedo_map is not None
-        if (self.meso is not None) + (self.model is not None) + plain != 1:
-            raise ValueError(
-                "expected exactly one of 'meso', 'model' (a .meso file) and 'albedo' or 'albedo_map' (a plain colour)"
-            )
-        if self.normal_map is not None and not plain:
-            raise ValueError("'normal_map' belongs to an 'albedo' or 'albedo_map'")
-        if self.double_sh is not None and self.sh_pca is not None:
-            raise ValueError("expected at most one of 'double_sh' and 'sh_pca', the kind of model")
-        if self.gdm is not None and self.meso is None:
-            raise ValueError("'gdm' says how to bake a 'meso'; it has none")
-        if self.model_fields_set & {"shell", "floor"} and not self.in_shell:
-            raise ValueError("'shell' and 'floor' belong to a 'gdm' or to a 'model' that is one (.gdm.zarr, .gdm.meso)")
-        if self.quilting is not None and (self.in_shell or (plain and not (self.albedo_map or self.normal_map))):
-            raise ValueError("'quilting' lays out a BTF, an MDF or pictures; a GDM and a plain colour have none")
-        if self.rank is not None and self.model is None:
-            raise ValueError("'rank' belongs to a 'model'; a 'meso' has 'eigen: {rank: ...}'")
-        return self
-
-    @property
-    def in_shell(self) -> bool:
-        """Whether it is a GDM."""
-        return self.gdm is not None or (self.model is not None and self.model.rstrip("/").endswith(GDMS))
-
-    @property
-    def finish(self) -> Finish | None:
-        """The plain look, None where there is a mesostructure or a model."""
-        if self.albedo is None and self.albedo_map is None:
-            return None
-        return Finish(
-            albedo=self.albedo or (1.0, 1.0, 1.0),
-            albedo_map=None if self.albedo_map is None else Path(self.albedo_map),
-            normal_map=None if self.normal_map is None else Path(self.normal_map),
-            normal_scale=self.normal_scale,
-        )
-
-
-class PlaceConfig(_Strict):
-    """Where something stands: scaled, then turned around x, y and z, then moved."""
-
-    scale: float = 1.0
-    rotate_deg: Vector = (0.0, 0.0, 0.0)
-    translate: Vector = (0.0, 0.0, 0.0)
-
-    def matrix(self) -> torch.Tensor:
-        """Return the 4 x 4 matrix."""
-        result = torch.eye(4, dtype=torch.float64) * self.scale
-        result[3, 3] = 1
-        for axis, angle in enumerate(self.rotate_deg):
-            a = torch.tensor(angle, dtype=torch.float64).deg2rad()
-            i, j = (axis + 1) % 3, (axis + 2) % 3
-            turn = torch.eye(4, dtype=torch.float64)
-            turn[i, i] = turn[j, j] = a.cos()
-            turn[j, i], turn[i, j] = a.sin(), -a.sin()
-            result = turn @ result
-        result[:3, 3] = torch.tensor(self.translate, dtype=torch.float64)
-        return result
-
-
-class RegionConfig(_Strict):
-    """Faces whose middle lies in a box, in the mesh's own coordinates before it is placed, and their material."""
-
-    low: Vector
-    high: Vector
-    material: str
-
-
-class ObjectConfig(PlaceConfig):
-    """A built-in shape or a mesh file, its materials, and where it stands.
-
-    `material` is that of all parts, `materials` gives others to parts of a file (`usemtl`, materials of a glTF file);
-    parts without either look as their file says. `regions` give materials to faces by where they lie, later ones over
-    earlier ones. `uv_set` chooses among a glTF file's texture coordinates; `unwrap`
-    (true, or options of the atlas) makes new ones at one `tile_size`. `instances` are further places, each applied
-    after the object's own; the mesh is read once.
-    """
-
-    material: str | None = None
-    materials: dict[str, str] = Field(default_factory=dict)
-    shape: str | None = None
-    mesh: str | None = None
-    options: dict[str, Any] = Field(default_factory=dict)
-    tiles: float | tuple[float, float] | None = None
-    uv_set: int = Field(default=0, ge=0)
-    unwrap: bool | UnwrapOptions = False
-    tile_size: float | None = None
-    instances: list[PlaceConfig] = Field(default_factory=list)
-    regions: list[RegionConfig] = Field(default_factory=list)
-
-    @model_validator(mode="after")
-    def _check(self) -> "ObjectConfig":
-        if (self.shape is None) == (self.mesh is None):
-            raise ValueError("expected exactly one of 'shape' and 'mesh'")
-        if self.shape is not None and self.shape not in SHAPES:
-            raise ValueError(f"expected a shape, got '{self.shape}'{did_you_mean(self.shape, SHAPES)}")
-        if self.shape is not None:
-            known = set(inspect.signature(SHAPES[self.shape]).parameters) - {"tiles"}
-            for key in self.options:
-                if key not in known:
-                    raise ValueError(f"{self.shape} has no option '{key}'{did_you_mean(key, known)}")
-            if self.material is None or self.materials or self.uv_set:
-                raise ValueError("a built-in 'shape' needs a 'material'; 'materials' and 'uv_set' belong to a 'mesh'")
-        elif self.options:
-            raise ValueError("'options' belong to built-in shapes")
-        if self.unwrap and (self.mesh is None or self.tile_size is None):
-            raise ValueError("'unwrap' makes texture coordinates for a 'mesh' and needs 'tile_size' (world units)")
-        return self
-
-    def build_shape(self) -> Mesh:
-        """Return the built-in shape, before it is placed.
-
-        Raises:
-            ConfigError: an option is of the wrong kind or out of range.
-        """
-        assert self.shape is not None
-        tiles = {} if self.tiles is None else {"tiles": self.tiles_pair}
-        return _call("objects.options", SHAPES[self.shape], {**self.options, **tiles})
-
-    @property
-    def tiles_pair(self) -> tuple[float, float]:
-        """Repetitions of the texture along u and v."""
-        if self.tiles is None:
-            return 1.0, 1.0
-        return self.tiles if isinstance(self.tiles, tuple) else (self.tiles, self.tiles)
-
-    @property
-    def used_materials(self) -> set[str]:
-        """Names of the materials it asks for."""
-        named = [*self.materials.values(), *(region.material for region in self.regions)]
-        return set(named) | ({self.material} if self.material is not None else set())
-
-    def places(self) -> list[torch.Tensor]:
-        """Return the 4 x 4 matrix of every place it stands at."""
-        own = self.matrix()
-        return [(place.matrix().double() @ own.double()) for place in self.instances] or [own]
-
-
-class DirectionalConfig(_Strict):
-    """A distant light; `irradiance` at normal incidence."""
-
-    type: Literal["directional"]
-    direction: Vector
-    irradiance: Vector = (torch.pi, torch.pi, torch.pi)
-
-    def build(self) -> Light:
-        """Return the light."""
-        towards = torch.tensor(self.direction, dtype=torch.float32)
-        if float(towards.norm()) == 0:
-            raise ConfigError("lights.direction: expected a direction towards the light, got 0, 0, 0")
-        return DirectionalLight(direction=towards / towards.norm(), irradiance=torch.tensor(self.irradiance))
-
-
-class PointConfig(_Strict):
-    """A point light; E = intensity / r^2."""
-
-    type: Literal["point"]
-    position: Vector
-    intensity: Vector
-
-    def build(self) -> Light:
-        """Return the light."""
-        position = torch.tensor(self.position, dtype=torch.float64)
-        return PointLight(position=position, intensity=torch.tensor(self.intensity))
-
-
-class SpotConfig(_Strict):
-    """A spot light at `position` that shines towards `at`."""
-
-    type: Literal["spot"]
-    position: Vector
-    at: Vector
-    intensity: Vector
-    inner_deg: float = 25.0
-    outer_deg: float = 30.0
-
-    def build(self) -> Light:
-        """Return the light."""
-        position = torch.tensor(self.position, dtype=torch.float64)
-        axis = (torch.tensor(self.at, dtype=torch.float64) - position).float()
-        if float(axis.norm()) == 0:
-            raise ConfigError("lights.at: expected another place than the light's position")
-        return SpotLight(
-            position=position,
-            axis=axis / axis.norm(),
-            intensity=torch.tensor(self.intensity),
-            inner_deg=self.inner_deg,
-            outer_deg=self.outer_deg,
-        )
-
-
-LightConfig = Annotated[DirectionalConfig | PointConfig | SpotConfig, Field(discriminator="type")]
-
-
-class CameraConfig(_Strict):
-    """A camera at `eye` that looks at `at`."""
-
-    eye: Vector
-    at: Vector = (0.0, 0.0, 0.0)
-    up: Vector = (0.0, 1.0, 0.0)
-    projection: Literal["perspective", "orthographic"] = "perspective"
-    fov_deg: float = 45.0
-    view_height: float = 2.0
-    width: int = 800
-    height: int = 600
-    near: float = 1e-3
-
-    def build(self) -> Camera:
-        """Return the camera.
-
-        Raises:
-            ConfigError: it looks nowhere, or a value is out of range.
-        """
-        eye, at, up = (torch.tensor(x, dtype=torch.float64) for x in (self.eye, self.at, self.up))
-        place, axes = look_at(eye, at, up)
-        rest = self.model_dump(exclude={"eye", "at", "up"})
-        return Camera(eye=place, axes=axes, **rest)
-
-
-class TruthConfig(_Strict):
-    """How the ray-traced truth is made: paths per pixel, bounces, and the longest edge of displaced triangles."""
-
-    samples: int = Field(default=16, ge=1, le=4096)
-    bounces: int = Field(default=2, ge=0, le=64)
-    max_edge: float = Field(default=0.1, gt=0)
-
-
-class Config(_Strict):
-    """Everything a picture needs."""
-
-    name: str = "scene"
-    materials: dict[str, MaterialConfig] = Field(default_factory=dict)
-    objects: list[ObjectConfig] = Field(min_length=1)
-    lights: list[LightConfig] = Field(default_factory=list)
-    ambient: float = Field(default=0.05, ge=0)
-    ambient_rule: Literal["add", "paper"] = "add"
-    background: Vector = (0.0, 0.0, 0.0)
-    camera: CameraConfig
-    backend: BackendChoice = "auto"
-    render: FrameOptions = Field(default_factory=FrameOptions)
-    truth: TruthConfig = Field(default_factory=TruthConfig)
-
-    @model_validator(mode="after")
-    def _check(self) -> "Config":
-        for name in sorted(set().union(*(item.used_materials for item in self.objects))):
-            if name not in self.materials:
-                raise ValueError(f"objects: no material is called '{name}'{did_you_mean(name, self.materials)}")
-        return self
 
 
 def load(path: str | Path) -> Config:
@@ -398,7 +71,7 @@ def parse(content: dict[str, Any], *, folder: Path, name: str = "config") -> Con
     except RecursionError as error:
         raise ConfigError(f"{name}: expected keys and values, got a section that holds itself") from error
     except ValidationError as error:
-        raise ConfigError(f"{name}: {_first_problem(error)}") from error
+        raise ConfigError(f"{name}: {first_problem(error, _known_keys)}") from error
 
 
 def build_meso(content: dict[str, Any]) -> Mesostructure:
@@ -410,7 +83,7 @@ def build_meso(content: dict[str, Any]) -> Mesostructure:
     try:
         return MesoConfig.model_validate(content).build()
     except ValidationError as error:
-        raise ConfigError(f"meso: {_first_problem(error)}") from error
+        raise ConfigError(f"meso: {first_problem(error, _known_keys)}") from error
 
 
 def meso_called(name: str) -> MesoConfig:
@@ -424,7 +97,7 @@ def meso_called(name: str) -> MesoConfig:
     try:
         return MesoConfig.model_validate(content)
     except ValidationError as error:
-        raise ConfigError(f"meso: {_first_problem(error)}") from error
+        raise ConfigError(f"meso: {first_problem(error, _known_keys)}") from error
 
 
 def with_silhouette(config: Config, silhouette: Silhouette) -> Config:
@@ -439,14 +112,6 @@ def data_dir() -> Path:
 
 
 PATH_KEYS = ("mesh", "model", "displacement", "albedo", "albedo_map", "normal_map", "path", "quilting")
-
-
-def _call(place: str, function: Callable[..., Any], arguments: dict[str, Any]) -> Any:
-    """Call `function` with arguments from a file, brought to the types it asks for."""
-    try:
-        return validate_call(function)(**arguments)
-    except ValidationError as error:
-        raise ConfigError(f"{place}.{_first_problem(error)}") from error
 
 
 def _resolve(content: Any, folder: Path) -> Any:
@@ -470,34 +135,6 @@ def _absolute(text: str, folder: Path) -> str:
             f"{text}: the folder of real inputs {root} is missing; set TORCHMESO_DATA to where it is on this machine"
         )
     return str(root / text.removeprefix("data:"))
-
-
-def _is_path(value: Any) -> bool:
-    return isinstance(value, str)
-
-
-def _first_problem(error: ValidationError) -> str:
-    """Return one sentence on the first problem of a validation."""
-    problems = error.errors()
-    # A misspelt key is both unknown and missing: say the former.
-    unknown = [p for p in problems if p["type"] in ("extra_forbidden", "unexpected_keyword_argument")]
-    problem = (unknown or problems)[0]
-    # Union branches and model names are pydantic's own; readers know keys and positions.
-    place = ".".join(str(x) for x in problem["loc"] if str(x) not in ("directional", "point", "spot"))
-    context = problem.get("ctx", {}).get("error")
-    if isinstance(context, MesoError):
-        return str(context)
-    if problem["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
-        key = str(problem["loc"][-1])
-        parent = place.rpartition(".")[0]
-        return f"unknown key '{place}'{did_you_mean(key, _known_keys(parent))}"
-    if problem["type"] in ("missing", "missing_keyword_only_argument"):
-        return f"'{place}' is missing"
-    text = problem["msg"].removeprefix("Value error, ")
-    text = text[0].lower() + text[1:]
-    if isinstance(context, ValueError):
-        return f"{place}: {text}" if place else text
-    return f"{place}: {text}, got {problem['input']!r}"
 
 
 def _known_keys(place: str) -> list[str]:

@@ -75,7 +75,7 @@ def test_bad_maps_are_named(rng, tmp_path):
     with pytest.raises(FormatError, match="none; make one with torchmeso synthesize"):
         quilting_map.load(tmp_path / "b.quilt")
     store.write_model(tmp_path / "c.quilt", {"x": index}, {"kind": "eigen"})
-    with pytest.raises(FormatError, match="expected a quilting map, got a file of kind 'eigen'"):
+    with pytest.raises(FormatError, match=r"expected a quilting map \(\.quilt\), got a file of kind 'eigen'"):
         quilting_map.load(tmp_path / "c.quilt")
     store.write_model(tmp_path / "d.quilt", {"quilting.index": index + 9}, {"quilting": {"source": [1, 2]}})
     with pytest.raises(FormatError, match="tileable"):

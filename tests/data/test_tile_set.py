@@ -56,5 +56,5 @@ def test_bad_tiles_are_named(rng, tmp_path):
     with pytest.raises(FormatError, match="found none; make one with"):
         tile_set.load(tmp_path / "none.tiles")
     store.write_model(tmp_path / "other.tiles", {"x": torch.zeros(1)}, {"kind": "quilting"})
-    with pytest.raises(FormatError, match="expected tiles, got a file of kind 'quilting'"):
+    with pytest.raises(FormatError, match=r"expected a set of tiles \(\.tiles\), got a file of kind 'quilting'"):
         tile_set.load(tmp_path / "other.tiles")

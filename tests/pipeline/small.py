@@ -2,7 +2,8 @@
 
 from pathlib import Path
 
-from torchmeso.config import Config, parse
+from torchmeso.config import parse
+from torchmeso.config_sections import Config
 
 CONTENT = {
     "name": "small",

@@ -90,7 +90,7 @@ def test_sh_pca_instead_of_eigen(cache):
 
 
 def test_content_of_files_counts(tmp_path):
-    from torchmeso.config import MesoConfig
+    from torchmeso.config_sections import MesoConfig
     from torchmeso.data import image
 
     image.write_png(tmp_path / "d.png", torch.rand(4, 4, 3))

@@ -6,7 +6,7 @@ from PIL import Image
 
 from tests.pipeline.small import small
 from torchmeso import config
-from torchmeso.config import ObjectConfig
+from torchmeso.config_sections import ObjectConfig
 from torchmeso.data.textured import Textured
 from torchmeso.errors import ConfigError, GeometryError
 from torchmeso.geometry import mesh_file

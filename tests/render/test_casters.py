@@ -5,19 +5,13 @@ import pytest
 import torch
 
 from tests.data.test_gdm import layered
-from tests.render.scenes import scene
+from tests.render.scenes import moved, scene
 from torchmeso.geometry import mesh, shapes
 from torchmeso.render import casters
 from torchmeso.render.casters import corners_of, extents
 from torchmeso.render.scene import Material, Object, Scene, assemble
 
 FROM_ABOVE = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
-
-
-def moved(shape, x=0.0, y=0.0, z=0.0):
-    matrix = torch.eye(4)
-    matrix[:3, 3] = torch.tensor([x, y, z])
-    return mesh.transform(shape, matrix)
 
 
 def turned(shape, x_deg):

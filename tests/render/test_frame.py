@@ -3,20 +3,14 @@ from dataclasses import replace
 import pytest
 import torch
 
-from tests.render.scenes import camera, scene, sun
+from tests.render.scenes import camera, moved, scene, sun
 from torchmeso.errors import ConfigError, SizeError
-from torchmeso.geometry import mesh, shapes
+from torchmeso.geometry import shapes
 from torchmeso.geometry.rays import RayScene
 from torchmeso.meso import bake_mdf, generators
 from torchmeso.meso.bake_mdf import MdfOptions
 from torchmeso.render.frame import FrameOptions, render
 from torchmeso.render.scene import in_double
-
-
-def moved(shape, x=0.0, y=0.0, z=0.0):
-    matrix = torch.eye(4)
-    matrix[:3, 3] = torch.tensor([x, y, z])
-    return mesh.transform(shape, matrix)
 
 
 def test_white_ball_under_a_sun_behind_the_eye():

@@ -3,75 +3,21 @@ from dataclasses import fields, replace
 import pytest
 import torch
 
-from tests.render.scenes import camera, sun
+from tests.render.scenes import LIGHTS, camera, moved, patched
 from torchmeso.backends import opencl
 from torchmeso.compress import double_sh, eigen, sh_pca
 from torchmeso.compress.double_sh import DoubleShOptions
 from torchmeso.compress.eigen import EigenOptions
 from torchmeso.compress.sh_pca import ShPcaOptions
-from torchmeso.data.sh_btf import ShBtf
-from torchmeso.data.sh_pca_btf import ShPcaBtf
 from torchmeso.data.textured import Textured
-from torchmeso.errors import BackendError
-from torchmeso.geometry import hemisphere, mesh, shapes
-from torchmeso.geometry.light import PointLight, SpotLight
-from torchmeso.meso import bake_btf, bake_mdf, generators
+from torchmeso.geometry import mesh, shapes
+from torchmeso.geometry.light import SpotLight
+from torchmeso.meso import bake_btf, generators
 from torchmeso.meso.bake_btf import BtfOptions
-from torchmeso.meso.bake_mdf import MdfOptions, RayCastMdf
 from torchmeso.render import frame
 from torchmeso.render.frame import FrameOptions, Skips
 from torchmeso.render.renderer import Renderer
 from torchmeso.render.scene import Material, Object, Scene, in_double
-
-
-def moved(shape, x=0.0, y=0.0, z=0.0):
-    matrix = torch.eye(4)
-    matrix[:3, 3] = torch.tensor([x, y, z])
-    return mesh.transform(shape, matrix)
-
-
-@pytest.fixture(scope="module")
-def brick():
-    """A brick wall of both tables, small."""
-    meso = generators.brick()
-    lights = views = "grid(8, 3, 80)"
-    table = bake_btf.in_memory(meso, BtfOptions(texels=16, lights=lights, views=views, samples=1, bounces=0))
-    model = eigen.fit(table, EigenOptions(rank=6))
-    return Material(btf=model, mdf=bake_mdf.in_memory(meso, MdfOptions(texels=32, views="grid(8, 4, 87.5)")))
-
-
-@pytest.fixture(scope="module")
-def weave():
-    """A material with holes, without a BTF."""
-    options = MdfOptions(texels=32, views="grid(8, 4, 87.5)")
-    return Material(mdf=bake_mdf.in_memory(generators.weave(), options), albedo=(0.7, 0.5, 0.3))
-
-
-@pytest.fixture(scope="module")
-def still_life(brick, weave):
-    """Two bodies and an open floor, a plain and two textured materials."""
-    return (
-        Object(mesh=moved(shapes.torus(tiles=(6, 2), triangles=600), y=0.3), material=brick),
-        Object(mesh=moved(shapes.sphere(radius=0.4, triangles=300), y=0.4), material=Material(albedo=(0.9, 0.2, 0.1))),
-        Object(mesh=moved(shapes.cylinder(radius=0.3, height=0.8, tiles=(4, 2), triangles=400), x=1.3), material=weave),
-        Object(mesh=moved(shapes.plane(size=(6.0, 6.0), tiles=(4, 4)), y=-0.6), material=brick),
-    )
-
-
-LIGHTS = {
-    "sun": (sun(1, 2, 1),),
-    "point": (PointLight(position=torch.tensor([1.5, 2.0, 1.5]), intensity=torch.full((3,), 20.0)),),
-    "spot": (
-        SpotLight(
-            position=torch.tensor([-1.0, 3.0, 1.0]),
-            axis=torch.nn.functional.normalize(torch.tensor([0.3, -1.0, -0.3]), dim=0),
-            intensity=torch.tensor([40.0, 30.0, 20.0]),
-            outer_deg=35.0,
-        ),
-        sun(-1, 1, 0.2),
-    ),
-    "none": (),
-}
 
 
 def compare(scene, view, options):
@@ -216,53 +162,6 @@ def test_what_stops_a_resting_light_is_found_out_once(still_life, device):
     assert left_out[0] == Renderer(scene, options).render(camera(eyes[0])).counts["shadow stamps left out"]
 
 
-def test_only_what_changed_is_uploaded(still_life, brick, device):
-    """Scene after scene: the picture of a renderer made for it, and what was the same is not made again."""
-    view, options = camera((1.5, 2.0, 3.5)), FrameOptions(shadow_map_size=128)
-    first = Scene(objects=still_life, lights=LIGHTS["spot"])
-    torus, ball, *rest = still_life
-    painted = replace(torus, material=replace(brick, btf=replace(brick.btf, scale=0.5 * brick.btf.scale)))
-    flat = replace(torus, material=replace(brick, mdf=None))
-    moving = replace(torus, mesh=moved(torus.mesh, x=-0.2, y=0.1))
-    red = replace(ball, material=Material(albedo=(0.2, 0.2, 0.9)))
-    faces = sum(len(o.mesh.faces) for o in still_life)
-    steps = {
-        "nothing": (first, 0, 0, 0),
-        "background": (replace(first, background=(0.3, 0.2, 0.1)), 0, 0, 0),
-        "albedo": (replace(first, objects=(torus, red, *rest)), 0, 0, 0),
-        "a BTF": (replace(first, objects=(painted, ball, *rest)), 0, 1, 0),
-        "an MDF": (replace(first, objects=(flat, ball, *rest)), 0, 0, 2),  # the floor still has the BTF
-        "a mesh": (replace(first, objects=(moving, ball, *rest)), faces, 0, 2),
-        "an object": (replace(first, objects=(torus, ball)), len(torus.mesh.faces) + len(ball.mesh.faces), 0, 2),
-        "no ambient": (replace(first, objects=(torus, ball), ambient=0.0), 0, 1, 0),
-        "light": (replace(first, objects=(torus, ball), ambient=0.0, lights=LIGHTS["sun"]), 0, 0, 1),
-        "all": (first, faces, 2, 2),
-    }
-    renderer = Renderer(first, options)
-    renderer.render(view)
-    assert renderer.counts["tables uploaded"] == 3
-    for name, (scene, n_face, n_table, n_map) in steps.items():
-        renderer.update(scene)
-        mine, fresh = renderer.render(view), Renderer(scene, options).render(view)
-        assert torch.equal(mine.rgb, fresh.rgb), name
-        assert torch.equal(mine.shadowed, fresh.shadowed), name
-        found = [renderer.counts[x] for x in ("faces uploaded", "tables uploaded", "shadow maps drawn")]
-        assert found == [n_face, n_table, n_map], name
-        assert torch.equal(renderer.render(view).rgb, fresh.rgb), name
-        assert renderer.counts["faces uploaded"] == renderer.counts["tables uploaded"] == 0
-
-
-def test_a_light_drawn_after_a_material_changed_sees_the_new_one(still_life, device):
-    view, options = camera((1.5, 2.0, 3.5)), FrameOptions(shadow_map_size=128)
-    plain = tuple(replace(o, material=replace(o.material, btf=None)) for o in still_life)
-    scene = Scene(objects=plain, lights=LIGHTS["sun"])
-    renderer = Renderer(Scene(objects=still_life, lights=LIGHTS["sun"]), options)
-    renderer.render(view)
-    renderer.update(scene)
-    fresh = Renderer(replace(scene, lights=LIGHTS["point"]), options).render(view)
-    assert torch.equal(renderer.render(view, LIGHTS["point"]).shadowed, fresh.shadowed)
-
-
 def test_triangles_stay_while_the_camera_does(still_life, device):
     """The light moves over them; with the eye in a body and triangles cut at the near plane too."""
     scene = Scene(objects=still_life, lights=LIGHTS["sun"])
@@ -278,16 +177,6 @@ def test_triangles_stay_while_the_camera_does(still_life, device):
             kept.append(mine.counts["triangles kept"])
         assert kept[3] > kept[2] == 0  # other sizes of maps make a new picture
         assert renderer.render(camera((1.0, 2.0, 3.5)), LIGHTS["spot"]).counts["triangles kept"] == 0
-
-
-def test_a_scene_that_cannot_be_read_leaves_the_one_before(still_life, device):
-    scene, view = Scene(objects=still_life, lights=LIGHTS["sun"]), camera((1.5, 2.0, 3.5))
-    renderer = Renderer(scene, FrameOptions(shadow_map_size=128))
-    before = renderer.render(view).rgb.clone()
-    bad = replace(still_life[0], material=Material(mdf=RayCastMdf(generators.sheet())))
-    with pytest.raises(BackendError, match="got RayCastMdf"):
-        renderer.update(replace(scene, objects=(bad, *still_life[1:])))
-    assert torch.equal(renderer.render(view).rgb, before)
 
 
 @pytest.mark.parametrize("filtering", [True, False])
@@ -311,16 +200,6 @@ def test_jittered_frames(projection, still_life, device):
     mean = torch.stack([renderer.render(c).rgb.double() for c in view.jittered(2)]).mean(0)
     torch.testing.assert_close(shown.render(view).rgb.double(), mean, atol=1e-6, rtol=1e-6)
     assert (shown.show(view)[..., :3].float() / 255).pow(2.2).sub(mean.clamp(0, 1)).abs().mean() < 0.02
-
-
-def test_what_kernels_cannot_read(device):
-    objects = (Object(mesh=shapes.sphere(triangles=100), material=Material(mdf=RayCastMdf(generators.sheet()))),)
-    with pytest.raises(BackendError, match="expected an MDF of 8 bits, got RayCastMdf"):
-        Renderer(Scene(objects=objects, lights=()))
-    many = LIGHTS["sun"] * 65
-    plain = Scene(objects=(Object(mesh=shapes.sphere(triangles=100), material=Material()),), lights=many)
-    with pytest.raises(BackendError, match="at most 64 lights, got 65"):
-        Renderer(plain).render(camera((0, 0, 4)))
 
 
 SKIPS = {
@@ -393,13 +272,6 @@ def test_ranks_that_add_less_than_the_error(device):
         assert (rough.rgb - exact.rgb).abs().max() <= 2 * error * (1 + scene.ambient)
 
 
-def patched(body, *materials, height=0.0):
-    """A body with other materials above each of several heights."""
-    middle = body.vertices[body.faces].mean(1)[:, 1]
-    part = sum((middle > height + 0.15 * k).long() for k in range(len(materials) - 1))
-    return Object(mesh=body, material=materials[0], others=materials[1:], part=part)
-
-
 @pytest.mark.parametrize("light", ["sun", "point"])
 @pytest.mark.parametrize("silhouette", ["none", "paper", "curved"])
 def test_bodies_of_several_materials(silhouette, light, brick, weave, device):
@@ -431,16 +303,6 @@ def test_a_material_cut_in_two_is_still_one(silhouette, brick, device):
         assert torch.equal(one.depth, two.depth)
         assert torch.equal(one.owner, two.owner)
         torch.testing.assert_close(one.rgb, two.rgb, rtol=0, atol=1e-5)
-
-
-def test_a_material_on_other_faces_is_uploaded(brick, device):
-    body, plain = shapes.torus(triangles=400), Material()
-    first = Scene(objects=(patched(body, brick, plain),), lights=LIGHTS["sun"])
-    renderer, view = Renderer(first), camera((1.5, 2.0, 2.5))
-    for o in (patched(body, brick, plain, height=0.1), Object(mesh=body, material=brick, others=(plain, plain))):
-        scene = replace(first, objects=(o,))
-        renderer.update(scene)
-        assert torch.equal(renderer.render(view).rgb, Renderer(scene).render(view).rgb)
 
 
 @pytest.mark.parametrize("rule", ["add", "paper"])
@@ -506,34 +368,6 @@ def test_components_of_spherical_harmonics(storage, rank, views, rule, brick, de
     assert wrong <= 4
     alike = (exact.owner == fast.owner) & (exact.shadowed == fast.shadowed).all(0)
     assert (exact.rgb - fast.rgb)[alike].abs().quantile(0.99) < 3e-4
-
-
-def test_harmonics_have_a_limit_on_the_device(device):
-    one, far = torch.ones(81, 1, 3), hemisphere.ubo81()
-    many = ShBtf(maps=torch.zeros(81, 1, 1, 1, 3), scale=one, offset=one, lights=far, views=far)
-    body = Object(mesh=shapes.plane(size=(1.0, 1.0), tiles=(1, 1)), material=Material(btf=many))
-    with pytest.raises(BackendError, match="expected at most 64 coefficients of light or view, got 81"):
-        Renderer(Scene(objects=(body,), lights=()))
-
-
-@pytest.mark.parametrize(("rank", "terms", "message"), [(3, 81, "64 coefficients .* got 81"), (193, 1, "192 comp")])
-def test_components_have_a_limit_on_the_device(rank, terms, message, device):
-    pole = hemisphere.from_rings([0], [1], [0])
-    many = ShPcaBtf(
-        maps=torch.zeros(1, 1, 1, rank), scale=torch.ones(rank), offset=torch.zeros(rank),
-        basis=torch.zeros(rank, terms, 3), lights=pole, views=pole,
-    )  # fmt: skip
-    body = Object(mesh=shapes.plane(size=(1.0, 1.0), tiles=(1, 1)), material=Material(btf=many))
-    with pytest.raises(BackendError, match=message):
-        Renderer(Scene(objects=(body,), lights=()))
-
-
-def test_whole_tables_are_for_torch(device):
-    options = BtfOptions(texels=2, lights="grid(4, 2, 80)", views="grid(4, 2, 80)", samples=1, bounces=0)
-    table = bake_btf.in_memory(generators.brick(), options)
-    body = Object(mesh=shapes.plane(size=(1.0, 1.0), tiles=(1, 1)), material=Material(btf=table))
-    with pytest.raises(BackendError, match=r"expected an eigen, double-SH or SH \+ PCA BTF, got Btf"):
-        Renderer(Scene(objects=(body,), lights=()))
 
 
 @pytest.mark.slow

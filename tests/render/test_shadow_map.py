@@ -3,8 +3,8 @@ import math
 import pytest
 import torch
 
-from tests.render.scenes import camera, scene, sun
-from torchmeso.geometry import mesh, shapes
+from tests.render.scenes import camera, moved, scene, sun
+from torchmeso.geometry import shapes
 from torchmeso.geometry.light import DirectionalLight, PointLight, SpotLight
 from torchmeso.meso import generators
 from torchmeso.meso.bake_mdf import RayCastMdf
@@ -13,12 +13,6 @@ from torchmeso.render.frame import FrameOptions, render
 from torchmeso.render.scene import assemble
 
 WHITE = torch.full((3,), 10.0)
-
-
-def moved(shape, x=0.0, y=0.0, z=0.0):
-    matrix = torch.eye(4)
-    matrix[:3, 3] = torch.tensor([x, y, z])
-    return mesh.transform(shape, matrix)
 
 
 def blocked(subject, light, positions, *, size=256, silhouette="curved"):

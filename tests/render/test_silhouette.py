@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from tests.render.scenes import camera, scene
+from tests.render.scenes import camera, moved, scene
 from torchmeso.data.mdf import Mdf
 from torchmeso.geometry import frames, hemisphere, mesh, shapes
 from torchmeso.meso import bake_mdf, generators
@@ -20,12 +20,6 @@ def intervals_of(subject, view):
     world = assemble(subject)
     layers = rasterize(view, world.vertices, world.faces)
     return world, layers, *find_intervals(layers, world)
-
-
-def moved(shape, x=0.0, y=0.0, z=0.0):
-    matrix = torch.eye(4)
-    matrix[:3, 3] = torch.tensor([x, y, z])
-    return mesh.transform(shape, matrix)
 
 
 def test_every_fragment_of_a_convex_body_opens_or_closes_one_interval():

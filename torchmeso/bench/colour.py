@@ -16,7 +16,7 @@ from torchmeso.bench.suite import Context, Row
 from torchmeso.compress import eigen
 from torchmeso.compress.eigen import EigenOptions
 from torchmeso.compress.quantize import Storage
-from torchmeso.config import Config
+from torchmeso.config_sections import Config
 from torchmeso.data import btf as btf_data
 from torchmeso.data.btf import Evaluable
 from torchmeso.pipeline import bake, truth

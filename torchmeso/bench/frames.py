@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from torchmeso import config
-from torchmeso.config import Config
+from torchmeso.config_sections import Config
 from torchmeso.geometry.camera import Camera
 from torchmeso.pipeline import scene as scenes
 from torchmeso.pipeline.bake import Report, prepare, silent

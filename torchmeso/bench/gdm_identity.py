@@ -16,12 +16,12 @@ from torch import Tensor
 
 from torchmeso import quality
 from torchmeso.bench.frames import SMALL
-from torchmeso.bench.gdm_error import NEAR, near_outline
+from torchmeso.bench.gdm_error import near_row
 from torchmeso.bench.gdm_speed import drawn, scene_of, table, view
 from torchmeso.bench.speed import MAP
 from torchmeso.bench.suite import Context, Row
 from torchmeso.bench.timing import time_together
-from torchmeso.config import MaterialConfig
+from torchmeso.config_sections import MaterialConfig
 from torchmeso.data.gdm import Gdm
 from torchmeso.data.mdf import Mdf
 from torchmeso.geometry import shapes
@@ -121,14 +121,9 @@ def outlines(context: Context) -> Iterator[Row]:
     context.report("weave: MDF", 0)
     depth = bake_mdf.in_memory(generators.weave(backing=True), MdfOptions(texels=64))
     right = true_mask(mesh, camera)
-    close = near_outline(right)
     for name, mask in masks(mesh, camera, gdm, depth).items():
         of = f"weave on a torus of 12,000 triangles, {name.replace('_', ' ')}"
-        yield Row(
-            id=f"outline.{name}.near", what=f"{of}: hit or miss as in the truth within {NEAR} px of the true outline",
-            value=round(100 * float((mask == right)[close].double().mean()), 2), unit="%", better="higher",
-            n=int(close.sum()), peer=f"IoU {quality.iou(mask, right):.4f}",
-        )  # fmt: skip
+        yield near_row(f"outline.{name}", of, mask, right)
         yield Row(
             id=f"outline.{name}.distance", what=f"{of}: mean distance of the outline from the true one", unit="px",
             value=round(quality.boundary_distance(mask, right), 3), better="lower",

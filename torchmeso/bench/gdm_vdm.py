@@ -14,9 +14,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchmeso import quality
 from torchmeso.bench import vdm
-from torchmeso.bench.gdm_error import NEAR, near_outline
+from torchmeso.bench.gdm_error import near_row
 from torchmeso.bench.gdm_speed import LIGHT, drawn, scene_of, table, view
 from torchmeso.bench.suite import Context, Row
 from torchmeso.bench.timing import time_together
@@ -102,15 +101,11 @@ def judge(name: str, mesh: Mesh, camera: Camera, found: dict[str, Float[Tensor, 
     """Yield how far pictures of depths are from rays at the same weave as triangles."""
     truth = true_depth(mesh, camera)
     right = truth.isfinite()
-    close, scale = near_outline(right), float(mesh.scale.mean())
+    scale = float(mesh.scale.mean())
     for kind, t in found.items():
         mask = t.isfinite()
         of = f"{name}, {kind.upper()} 64x64"
-        yield Row(
-            id=f"vdm.{name}.{kind}.near", what=f"{of}: hit or miss as in truth, {NEAR} px around the outline",
-            value=round(100 * float((mask == right)[close].double().mean()), 2), unit="%", better="higher",
-            n=int(close.sum()), peer=f"IoU {quality.iou(mask, right):.4f}",
-        )  # fmt: skip
+        yield near_row(f"vdm.{name}.{kind}", of, mask, right)
         off = (t - truth)[mask & right].abs() / (scale * voxel)
         for share, word in ((0.5, "median"), (0.95, "p95")):
             yield Row(

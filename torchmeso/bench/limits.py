@@ -16,7 +16,7 @@ from torch import Tensor
 
 from torchmeso import config, quality
 from torchmeso.bench.suite import Context, Row
-from torchmeso.config import Config
+from torchmeso.config_sections import Config
 from torchmeso.pipeline import scene as scenes
 from torchmeso.pipeline import truth
 from torchmeso.pipeline.bake import prepare

@@ -18,7 +18,7 @@ from torchmeso.bench import colour, limits, million, minify, peers, scenes, spee
 from torchmeso.bench.peers import PeerMissing
 from torchmeso.bench.suite import Context, Measurement, Row
 from torchmeso.bench.timing import Timing, time_together
-from torchmeso.config import Config
+from torchmeso.config_sections import Config
 from torchmeso.data.address import texel_centres
 from torchmeso.data.mdf import Mdf
 from torchmeso.errors import BackendError

@@ -18,7 +18,8 @@ from torch import Tensor
 from torchmeso.bench import frames, graphcut, speed, wang
 from torchmeso.bench.suite import Context, Measurement, Row
 from torchmeso.bench.timing import time_together
-from torchmeso.config import MaterialConfig, data_dir
+from torchmeso.config import data_dir
+from torchmeso.config_sections import MaterialConfig
 from torchmeso.data import address, image
 from torchmeso.data.eigen_btf import EigenBtf
 from torchmeso.data.quilting_map import QuiltingMap

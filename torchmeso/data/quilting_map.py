@@ -22,7 +22,7 @@ from jaxtyping import Bool, Int, Shaped
 from torch import Tensor
 
 from torchmeso.data import store
-from torchmeso.errors import FormatError, ShapeError, check_shape
+from torchmeso.errors import ShapeError, check_shape
 
 MOST = 1 << 15
 """Rows and columns of an exemplar: kernels keep both numbers in 32 bits."""
@@ -132,12 +132,7 @@ def open_file(path: str | Path) -> store.Model:
     Raises:
         FormatError: the file is missing, damaged, or holds no quilting map.
     """
-    if not Path(path).is_file():
-        raise FormatError(f"{path}: expected a quilting map (.quilt), found none; make one with torchmeso synthesize")
-    model = store.Model(path)
-    if not isinstance(model.meta.get("quilting"), dict):
-        raise FormatError(f"{path}: expected a quilting map, got a file of kind '{model.meta.get('kind', 'unknown')}'")
-    return model
+    return store.open_kind(path, "quilting", expected="a quilting map (.quilt)", make="torchmeso synthesize")
 
 
 def describe(path: str | Path) -> dict[str, Any]:

@@ -242,6 +242,20 @@ class Model:
         return self._file.get_tensor(name)
 
 
+def open_kind(path: str | Path, section: str, *, expected: str, make: str) -> Model:
+    """Return the model at `path`, whose header has a `section`; it holds what is `expected`, which `make` makes.
+
+    Raises:
+        FormatError: the file is missing or damaged, or holds something else.
+    """
+    if not Path(path).is_file():
+        raise FormatError(f"{path}: expected {expected}, found none; make one with {make}")
+    model = Model(path)
+    if not isinstance(model.meta.get(section), dict):
+        raise FormatError(f"{path}: expected {expected}, got a file of kind '{model.meta.get('kind', 'unknown')}'")
+    return model
+
+
 @contextmanager
 def reading(path: str | Path) -> Iterator[None]:
     """Turn whatever goes wrong while a file is decoded into a FormatError that names `path`.

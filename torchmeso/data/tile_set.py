@@ -22,7 +22,7 @@ from torch import Tensor
 
 from torchmeso.data import store
 from torchmeso.data.quilting_map import MOST, SMALL, QuiltingMap
-from torchmeso.errors import ConfigError, FormatError, ShapeError, check_shape
+from torchmeso.errors import ConfigError, ShapeError, check_shape
 
 Marks = Literal["edges", "corners"]
 
@@ -153,14 +153,8 @@ def open_file(path: str | Path) -> store.Model:
     Raises:
         FormatError: the file is missing, damaged, or holds no tiles.
     """
-    if not Path(path).is_file():
-        raise FormatError(
-            f"{path}: expected a set of tiles (.tiles), found none; make one with torchmeso synthesize --method wang"
-        )
-    model = store.Model(path)
-    if not isinstance(model.meta.get("tiles"), dict):
-        raise FormatError(f"{path}: expected tiles, got a file of kind '{model.meta.get('kind', 'unknown')}'")
-    return model
+    make = "torchmeso synthesize --method wang"
+    return store.open_kind(path, "tiles", expected="a set of tiles (.tiles)", make=make)
 
 
 def describe(path: str | Path) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from typing import Literal
 
 import torch
 
-from torchmeso.config import Config, Vector
+from torchmeso.config_sections import Config, Vector
 from torchmeso.data import store, video
 from torchmeso.errors import check_range
 from torchmeso.geometry.camera import Camera

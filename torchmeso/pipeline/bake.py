@@ -18,7 +18,7 @@ from torchmeso.compress import factored, stream
 from torchmeso.compress.double_sh import DoubleShOptions
 from torchmeso.compress.eigen import EigenOptions
 from torchmeso.compress.sh_pca import ShPcaOptions
-from torchmeso.config import Config, MaterialConfig, MesoConfig
+from torchmeso.config_sections import Config, MaterialConfig, MesoConfig
 from torchmeso.data import (
     btf,
     eigen_btf,

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchmeso import quality
-from torchmeso.config import Config
+from torchmeso.config_sections import Config
 from torchmeso.data import image
 from torchmeso.data.store import replacing
 from torchmeso.errors import FormatError

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 
 from torchmeso import config
+from torchmeso.config_sections import ObjectConfig
 from torchmeso.data import (
     btf,
     btfdbb,
@@ -283,7 +284,7 @@ def _config(path: Path) -> dict[str, Any]:
     }
 
 
-def _object(item: config.ObjectConfig) -> str:
+def _object(item: ObjectConfig) -> str:
     names = ", ".join(sorted(item.used_materials)) or "as its file says"
     times = f" x {len(item.instances)}" if item.instances else ""
     return f"{item.shape or Path(str(item.mesh)).name}{times} ({names})"

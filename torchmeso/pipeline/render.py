@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from torchmeso.backends import BackendChoice, opencl
-from torchmeso.config import Config
+from torchmeso.config_sections import Config
 from torchmeso.data import image
 from torchmeso.errors import BackendError
 from torchmeso.geometry.camera import Camera

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from torchmeso.config import Config, ObjectConfig
+from torchmeso.config_sections import Config, ObjectConfig
 from torchmeso.errors import ConfigError, did_you_mean
 from torchmeso.geometry import mesh, mesh_file, unwrap
 from torchmeso.geometry.mesh import Mesh

@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchmeso.config import Config, MaterialConfig, ObjectConfig
+from torchmeso.config_sections import Config, MaterialConfig, ObjectConfig
 from torchmeso.data import store, textured
 from torchmeso.errors import ConfigError
 from torchmeso.geometry.camera import Camera

@@ -10,11 +10,8 @@ Kernels: kernels_cl/render/renderer.cl, kernels_cl/render/shadow_map.cl         
 """
 
 import itertools
-import operator
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -24,32 +21,18 @@ from torch import Tensor
 from torchmeso.backends import opencl
 from torchmeso.data import image
 from torchmeso.errors import BackendError, check_memory
-from torchmeso.geometry import shell
 from torchmeso.geometry.camera import Camera
 from torchmeso.geometry.light import DirectionalLight, Light, SpotLight
-from torchmeso.render import device, device_gdm, device_shell, device_tables, film, shadow_map
-from torchmeso.render.casters import Corners, corners_of
+from torchmeso.render import device, film, shadow_map
+from torchmeso.render.device_picture import DETAILS, DISPLAY, MOST_STARTS, DevicePicture, named
 from torchmeso.render.device_raster import ROOM, STAMPS, DeviceViews
+from torchmeso.render.device_scene import are, depths, upload_scene
 from torchmeso.render.film import Picture
-from torchmeso.render.frame import MEMORY_LIMIT, FrameOptions, Skips
-from torchmeso.render.scene import Material, Scene, World, assemble
+from torchmeso.render.frame import MEMORY_LIMIT, FrameOptions
+from torchmeso.render.scene import Scene
 
 MAX_LIGHTS = 64
 """Of a frame, as in kernels_cl/render/shadow_map.clh."""
-
-DETAILS, DISPLAY = 1, 2
-"""What a frame writes: a `Picture`, or bytes for a screen."""
-
-MOST_STARTS = 4
-"""Tetrahedra of shells that the eye is in; the others of a shell that overlaps itself more often are left out."""
-
-FRAME = np.dtype(
-    [(name, "i4") for name in ("lights", "ambient_paper", "depths", "outputs")]
-    + [(name, "i4") for name in ("capacity", "skips", "stride", "pitch")]
-    + [("ambient", "f4"), ("background", "f4", 3), ("rank_error", "f4"), ("pixel", "f4")]
-    + [("starts", "i4"), ("pad", "i4"), ("start_tet", "i4", MOST_STARTS), ("start_surface", "i4", MOST_STARTS)]
-    + [("start_place", "f4", (MOST_STARTS, 4))]
-)
 
 
 class Renderer:
@@ -67,10 +50,10 @@ class Renderer:
         self._workers = opencl.units()
         self._extra, self._cut_room, self._light_room, self._kept_room = 4096, 0, 1, 0
         self._lists: tuple[opencl.Buffer, opencl.Buffer] | None = None
-        self._picture: _Picture | None = None
+        self._picture: DevicePicture | None = None
         self._maps: _Maps | None = None
         self.counts: dict[str, int] = {}
-        self._on_device = _upload(scene, self.options)
+        self._on_device = upload_scene(scene, self.options)
         self._choose_code()
         self._uploaded = self._on_device.since(None)
         self._seconds = {"upload": time.perf_counter() - start}
@@ -84,13 +67,13 @@ class Renderer:
             BackendError: a material is of a kind that kernels do not read; the scene from before is still rendered.
         """
         start = time.perf_counter()
-        before, self._on_device = self._on_device, _upload(scene, self.options, self._on_device)
+        before, self._on_device = self._on_device, upload_scene(scene, self.options, self._on_device)
         self._choose_code()
         moved = self._on_device.geometry is not before.geometry
         if self._maps is not None:
             if moved:
                 self._maps.views = self._views(self._maps.views.count)
-            if moved or not _are(_depths(scene), _depths(before.scene)):
+            if moved or not are(depths(scene), depths(before.scene)):
                 self._maps.lights = None
             self._maps.draw = self._map_calls(self._maps)
         if self._picture is not None:
@@ -154,7 +137,7 @@ class Renderer:
         picture = self._frame(camera, lights, DISPLAY)
         return picture.shown[: camera.height, : camera.width]
 
-    def _frame(self, camera: Camera, lights: tuple[Light, ...] | None, outputs: int) -> "_Picture":
+    def _frame(self, camera: Camera, lights: tuple[Light, ...] | None, outputs: int) -> DevicePicture:
         world = self._on_device.world
         given = lights = world.lit_by(self._on_device.scene.lights if lights is None else lights)
         camera = world.seen_by(camera)
@@ -184,7 +167,7 @@ class Renderer:
         opencl.read(picture.results[:1] if outputs == DISPLAY else picture.results[1:])
         picture.lit = (len(given), reaching)
         faces = sum(maps.faces) if maps else 0
-        self.counts = _named(counts[0], camera) | {
+        self.counts = named(counts[0], camera) | {
             "lights left out": len(given) - len(reaching),
             "shadow maps drawn": faces if drawn else 0,
             "shadow maps kept": 0 if drawn else faces,
@@ -246,7 +229,7 @@ class Renderer:
             self._lists = opencl.allocate(64 * capacity), opencl.allocate(64 * capacity)
         return self._lists
 
-    def _room(self, camera: Camera, lights: tuple[Light, ...]) -> "tuple[_Maps | None, _Picture]":
+    def _room(self, camera: Camera, lights: tuple[Light, ...]) -> "tuple[_Maps | None, DevicePicture]":
         """Return where shadow maps and picture are drawn; the same as before where their sizes are."""
         guess = camera.width * camera.height // 64  # a stamp in four is deeper than it begins with
         if guess > self._extra:
@@ -261,7 +244,8 @@ class Renderer:
         self._light_room = max(self._light_room, len(lights))
         key = (camera.width, camera.height, self._light_room, wanted)
         if self._picture is None or self._picture.key != key:
-            self._picture = self._make_picture(key)
+            self._picture = DevicePicture.make(key, self._views(1))
+            self._picture.draw = self._picture_call(self._picture)
         return self._maps, self._picture
 
     def _draw_maps(self, maps: "_Maps", lights: tuple[Light, ...]) -> bool:
@@ -309,7 +293,7 @@ class Renderer:
             for number in range(views.count)
         ]  # fmt: skip
 
-    def _draw_picture(self, picture: "_Picture", camera: Camera, lights: tuple[Light, ...], outputs: int) -> None:
+    def _draw_picture(self, picture: DevicePicture, camera: Camera, lights: tuple[Light, ...], outputs: int) -> None:
         """Draw the picture of the camera it is aimed with."""
         scene, maps = self._on_device.scene, self._maps
         if picture.shone is not lights:
@@ -344,24 +328,7 @@ class Renderer:
         s = self._skips
         return s.empty | s.behind << 1 | s.bounds << 2 | s.losers << 3 | s.facing << 4 | s.unseen << 5
 
-    def _make_picture(self, key: tuple) -> "_Picture":
-        width, height, n_light, _ = key
-        rows, pitch = -(-height // 4) * 4, -(-width // 4) * 4
-        rgba, depth = torch.zeros(rows, pitch, 4), torch.zeros(rows, pitch)
-        owner = torch.zeros(rows, pitch, dtype=torch.int32)
-        shadowed = torch.zeros(max(n_light, 1), rows, pitch, dtype=torch.uint8)
-        shown = torch.zeros(rows, pitch, 4, dtype=torch.uint8)
-        results = [(opencl.buffer(x), x) for x in (shown, rgba, depth, owner, shadowed)]
-        lights = opencl.Shared(np.zeros(max(n_light, 1), device.LIGHT))
-        frame, empty = opencl.Shared(np.zeros(1, FRAME)), opencl.Shared(np.zeros(rows * pitch // 16, np.uint8))
-        picture = _Picture(
-            key=key, views=self._views(1), results=results, lights=lights, frame=frame, empty=empty,
-            shown=shown, rgba=rgba, depth=depth, owner=owner, shadowed=shadowed,
-        )  # fmt: skip
-        picture.draw = self._picture_call(picture)
-        return picture
-
-    def _picture_call(self, picture: "_Picture") -> opencl.Call:
+    def _picture_call(self, picture: DevicePicture) -> opencl.Call:
         """Return the call that draws a picture."""
         geometry, materials = self._on_device.geometry, self._on_device.materials
         maps, views = self._maps, picture.views
@@ -378,75 +345,6 @@ class Renderer:
         )  # fmt: skip
 
 
-class _OnDevice(NamedTuple):
-    """A scene and its side on the device."""
-
-    scene: Scene
-    world: World
-    geometry: device.DeviceGeometry
-    materials: device_tables.DeviceMaterials
-    corners: Corners
-    object_of: list[int]  # of each surface
-    shells: device_shell.DeviceShells | None
-    gdms: device_gdm.DeviceGdms | None
-
-    def starts(self, camera: Camera) -> Iterator[tuple[int, int, list[float]]]:
-        """Yield the tetrahedra that the eye is in, their surfaces, and its texture coordinates there."""
-        for placed in self.world.shells if camera.projection == "perspective" else ():
-            for tet, place in zip(*shell.around(placed.shell, camera.eye), strict=True):
-                yield int(tet) + placed.first_tet, placed.surface, place.tolist()
-
-    @property
-    def of_shells(self) -> "tuple[opencl.Buffer, ...]":
-        """What kernels are given of them."""
-        if self.shells is None or self.gdms is None:
-            return ()
-        return (*self.shells, self.gdms.tables, self.gdms.gdms)
-
-    @property
-    def mixed(self) -> bool:
-        """Return whether an interval can have different mesostructures at its ends."""
-        return any(len({id(m.mdf) for m in o.materials}) > 1 for o in self.scene.objects)
-
-    def since(self, before: "_OnDevice | None") -> dict[str, int]:
-        """Return what was uploaded that was not there before."""
-        meshes = before is None or self.geometry is not before.geometry
-        return {"faces uploaded": self.geometry.mesh.n_face * meshes, "tables uploaded": self.materials.packed}
-
-
-def _upload(scene: Scene, options: FrameOptions, before: _OnDevice | None = None) -> _OnDevice:
-    """Return `scene` on the device, with what it shares with the one before."""
-    materials = device_tables.upload_materials(
-        scene.surfaces,
-        silhouettes=options.silhouette != "none",
-        ambient=scene.ambient > 0,
-        before=None if before is None else before.materials,
-    )
-    gdms = device_gdm.upload_gdms(
-        [_dressing(m, options.skips) for m in scene.surfaces], None if before is None else before.gdms
-    )
-    object_of = [i for i, o in enumerate(scene.objects) for _ in o.materials]
-    same = before is not None and _are(_meshes(scene), _meshes(before.scene)) and object_of == before.object_of
-    if before is not None and same:
-        return before._replace(scene=scene, materials=materials, gdms=gdms)
-    world = assemble(scene)
-    corners = corners_of(world)
-    shells = None
-    if world.shells:
-        shells = device_shell.upload_shells([(s.shell, s.mesh, s.first_vertex) for s in world.shells])
-    return _OnDevice(
-        scene, world, device.upload_geometry(world), materials, corners, object_of, shells, gdms if shells else None
-    )
-
-
-def _dressing(material: Material, skips: Skips) -> device_gdm.Dressing | None:
-    gdm, form = material.gdm, material.shell
-    if gdm is None:
-        return None
-    bend = device_gdm.BEND * gdm.voxel if skips.carried else 0.0
-    return device_gdm.Dressing(gdm, gdm.h, form.queries, form.base == "solid", material.albedo, bend)
-
-
 @dataclass(eq=False, kw_only=True)
 class _Maps:
     """Shadow maps of all lights on the device."""
@@ -460,88 +358,6 @@ class _Maps:
     lights: tuple[Light, ...] | None = None  # that they were drawn for
 
 
-@dataclass(eq=False, kw_only=True)
-class _Picture:
-    """What a frame of one size writes into."""
-
-    key: tuple
-    views: DeviceViews
-    results: "list[tuple[opencl.Buffer, Tensor]]"
-    lights: opencl.Shared
-    frame: opencl.Shared
-    empty: opencl.Shared
-    draw: opencl.Call = field(init=False)
-    shown: Tensor
-    rgba: Tensor
-    depth: Tensor
-    owner: Tensor
-    shadowed: Tensor
-    outputs: int = 0
-    shone: tuple[Light, ...] | None = None
-    lit: tuple[int, list[int]] = (0, [])
-
-    def finished(
-        self, camera: Camera, object_of: list[int], counts: dict[str, int], seconds: dict[str, float]
-    ) -> Picture:
-        """Return the frame just drawn; kernels count surfaces, `object_of` says whose they are."""
-        height, width = camera.height, camera.width
-        count, reaching = self.lit
-        shadowed = torch.zeros(count, height, width, dtype=torch.bool)
-        shadowed[reaching] = self.shadowed[: len(reaching), :height, :width].bool()
-        return Picture(
-            rgb=self.rgba[:height, :width, :3],
-            depth=self.depth[:height, :width],
-            owner=torch.tensor([*object_of, -2, -1])[self.owner[:height, :width].long()],
-            shadowed=shadowed,
-            counts=counts,
-            seconds=seconds,
-        )
-
-
-def _meshes(scene: Scene) -> list[object]:
-    shells: list[object] = [x for m in scene.surfaces for x in (m.gdm, m.shell)]
-    return [*shells, *(x for o in scene.objects for x in (o.mesh, o.part))]
-
-
-def _depths(scene: Scene) -> list[object]:
-    return [m.mdf for m in scene.surfaces]
-
-
-def _are(a: list[object], b: list[object]) -> bool:
-    """Return whether two lists hold the same objects."""
-    return len(a) == len(b) and all(map(operator.is_, a, b))
-
-
 def _same(a: tuple[Light, ...], b: tuple[Light, ...]) -> bool:
     """Return whether two sets of lights are the same, whether or not they are the same objects."""
     return a is b or device.light_records(a).tobytes() == device.light_records(b).tobytes()
-
-
-def _named(counts: dict[str, int], camera: Camera) -> dict[str, int]:
-    """Return the counters under the names of `Picture.counts`."""
-    return {
-        "triangles drawn": counts["drawn"],
-        "fragments": counts["fragments"],
-        "layers": counts["deepest"],
-        "pixels with a fragment": counts["covered"],
-        "pixels": camera.width * camera.height,
-        "intervals": counts["intervals"],
-        "intervals passed by their length": counts["deep"],
-        "intervals passed by the facets alone": counts["bounded"],
-        "intervals carved": counts["carved"],
-        "pixels inside an object": counts["inside"],
-        "depth look-ups": counts["looked"],
-        "stretches behind a resolved pixel": counts["hidden"],
-        "triangles without a pixel": counts["degenerate"],
-        "triangles behind the eye": counts["behind"],
-        "stamps that stayed empty": counts["empty"],
-        "groups of components spared": counts["spared"],
-        "triangles beside the view": counts["beside"],
-        "triangles turned away": counts["turned"],
-        "losing fragments not shaded": counts["losers"],
-        "shadow tests of what leans away": counts["averted"],
-        "prisms passed": counts["prisms"],
-        "tetrahedra passed": counts["tets"],
-        "rays lost in a shell": counts["endless"],
-        "prisms passed without a look-up": counts["carried"],
-    }
