@@ -91,6 +91,7 @@ def compress(
 
     A BTF is a .btf.zarr or .btf, a folder or zip of pictures, or an RTI set (.lp); a GDM is a .gdm.zarr.
     """
+    from torchmeso.backends.allocator import give_back_freed_memory
     from torchmeso.compress import budget_stream, stream
     from torchmeso.compress.eigen import EigenOptions
     from torchmeso.data import journal, mdf
@@ -113,6 +114,7 @@ def compress(
         told = partial(report, f"{method} BTF")
         key = f"{journal.state_of(table)} {code_hash()}"
         if wanted is not None:
+            give_back_freed_memory()
             if isinstance(chosen, EigenOptions):
                 chosen = replace(chosen, rank=options["rank"] or len(source.views))
             found = budget_stream.fit(source, chosen, wanted, out, key=key, silhouette=depth, progress=told)

@@ -5,8 +5,9 @@ import pytest
 
 PROGRAM = """
 import resource, sys, torch
-from torchmeso.backends.allocator import keep_freed_memory
-kept = keep_freed_memory() if sys.argv[1] == "keep" else False
+from torchmeso.backends.allocator import give_back_freed_memory, keep_freed_memory
+kept = keep_freed_memory() if sys.argv[1] != "leave" else False
+kept = give_back_freed_memory() if sys.argv[1] == "give back" else kept
 for _ in range(3): torch.empty(1 << 24).fill_(1)
 before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
 for _ in range(20): torch.empty(1 << 24).fill_(1)
@@ -27,6 +28,34 @@ def test_blocks_that_come_again_do_not_fault_again():
     if kept != "True":
         pytest.skip("another C library")
     assert few < 0.6 * faults("leave")[1]
+    assert faults("give back")[1] > 2 * few
+
+
+FITTING = """
+import re, sys, torch
+from torchmeso.backends.allocator import give_back_freed_memory, keep_freed_memory
+kept = keep_freed_memory() and (sys.argv[1] == "keep" or give_back_freed_memory())
+small = []
+for k in range(40):
+    large = torch.empty(5 << 20).fill_(1)  # 20 MiB
+    small.append(large[:50000].clone())  # 200 kB that stay
+    del large
+    small.append(torch.empty(1 << 18).fill_(1))
+print(kept, re.search(r"VmHWM:\\s*(\\d+)", open("/proc/self/status").read())[1])
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="glibc only")
+def test_a_fit_that_keeps_little_of_much_stays_small():
+    def peak(mode):
+        said = subprocess.run([sys.executable, "-c", FITTING, mode], capture_output=True, text=True, check=True).stdout
+        kept, size = said.split()
+        return kept, int(size)
+
+    kept, small = peak("give back")
+    if kept != "True":
+        pytest.skip("another C library")
+    assert small + 100_000 < peak("keep")[1]
 
 
 def test_other_systems_are_left_alone(monkeypatch):
@@ -34,3 +63,4 @@ def test_other_systems_are_left_alone(monkeypatch):
 
     monkeypatch.setattr(sys, "platform", "darwin")
     assert not allocator.keep_freed_memory()
+    assert not allocator.give_back_freed_memory()
