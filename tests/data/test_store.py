@@ -150,6 +150,19 @@ def test_damaged_chunks_are_reported(tmp_path):
 
 
 @pytest.mark.errors
+def test_no_damage_to_a_chunk_is_decoded(tmp_path):
+    """Blosc itself believes what a chunk says: other values would come out, or it would read far behind its end."""
+    fill(tmp_path / "a.zarr", range(4)).finish()
+    chunk = tmp_path / "a.zarr/x/c/2/0"
+    whole = chunk.read_bytes()
+    assert torch.frombuffer(bytearray(whole), dtype=torch.uint8)[:2].tolist() == [2, 1]  # Blosc's versions come first
+    for at in range(24):
+        chunk.write_bytes(whole[:at] + bytes([whole[at] ^ 0x10]) + whole[at + 1 :])
+        with pytest.raises(FormatError, match="'x' cannot be read"):
+            store.read_array(store.open_table(tmp_path / "a.zarr", "toy"), "x")
+
+
+@pytest.mark.errors
 def test_missing_and_foreign_models_say_so(tmp_path):
     with pytest.raises(FormatError, match="expected a run-time model"):
         store.Model(tmp_path / "no.meso")

@@ -16,7 +16,7 @@ M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
 KEEP = 1 << 30
 """Bytes of a block up to which it comes from, and free memory up to which it stays in, the heap of a renderer."""
 
-GIVE_BACK = 32 << 20
+GIVE_BACK = 16 << 20
 """The same of a fit."""
 
 
