@@ -4,13 +4,14 @@ import pytest
 import torch
 
 from tests.render.scenes import camera, moved, scene, sun
-from torchmeso.geometry import shapes
+from torchmeso.geometry import mesh, shapes
 from torchmeso.geometry.light import DirectionalLight, PointLight, SpotLight
 from torchmeso.meso import generators
 from torchmeso.meso.bake_mdf import RayCastMdf
 from torchmeso.render import shadow_map
 from torchmeso.render.frame import FrameOptions, render
 from torchmeso.render.scene import assemble
+from torchmeso.render.shadow_map import Above
 
 WHITE = torch.full((3,), 10.0)
 
@@ -179,6 +180,22 @@ def test_a_point_sunk_beyond_a_crease_is_as_dark_as_its_surface():
     shadow = shadow_map.build(subject, world, light, size=512, silhouette="curved")
     surface = torch.tensor([[-0.118, 0, 0.69], [1.083, 0, 0.72]])  # behind the gap; on the side of the light
     sunk = torch.tensor([[-0.12, 0, 0.72], [1.06, 0, 0.72]])
+    lean = torch.tensor([0.5, 0.9])
     assert shadow_map.blocked(shadow, surface).tolist() == [True, False]
     assert shadow_map.blocked(shadow, sunk).tolist() == [False, False]
-    assert shadow_map.blocked(shadow, sunk, surface=surface).tolist() == [True, False]
+    assert shadow_map.blocked(shadow, sunk, above=Above(surface, lean)).tolist() == [True, False]
+
+
+@pytest.mark.parametrize("size", [16, 32, 64, 512])
+def test_no_light_comes_through_a_gap_that_is_finer_than_a_texel(size):
+    """The same ring, whose gap coarse maps do not show; a shadow would first start on a sheet in its body."""
+    sheet = mesh.transform(shapes.plane(size=(0.2, 0.2)), torch.tensor(
+        [[0, 1, 0, -0.3], [1, 0, 0, 0], [0, 0, -1, 0.8], [0, 0, 0, 1.0]]
+    ))  # fmt: skip
+    subject, light = scene(shapes.torus(tube=0.3, triangles=20_000), sheet), sun(1, 0, 0)
+    shadow = shadow_map.build(subject, assemble(subject), light, size=size, silhouette="curved")
+    surface = torch.tensor([[-0.118, 0, 0.69], [1.08, 0, 0.72]])
+    sunk = torch.tensor([[-0.12, 0, 0.75], [1.06, 0, 0.72]])
+    for position in (surface, sunk):
+        above = Above(surface, torch.tensor([0.5, 0.9]))
+        assert shadow_map.blocked(shadow, position, above=above).tolist() == [True, False]

@@ -15,11 +15,13 @@ from torch import Tensor
 
 from torchmeso.errors import check_memory, check_range
 from torchmeso.geometry.camera import Camera
+from torchmeso.geometry.directions import dot
+from torchmeso.geometry.light import illuminate
 from torchmeso.render import film, gdm_shade, shadow_map
 from torchmeso.render.btf_shade import shade
 from torchmeso.render.film import Picture
 from torchmeso.render.rasterize import Layers, rasterize
-from torchmeso.render.scene import Scene, World, assemble, interpolate, rays
+from torchmeso.render.scene import Points, Scene, World, assemble, interpolate, rays
 from torchmeso.render.silhouette import Candidates, Counts, Silhouette, find_candidates, nearest
 
 MEMORY_LIMIT = 16 << 30
@@ -155,7 +157,7 @@ def _develop(
     points = interpolate(world, layers, camera, plain.fragment)
     owner[plain.pixel] = world.object[points.owner]
     origin, direction, _ = rays(camera, plain.pixel, dtype)
-    dark = _blocked(scene, maps, origin + plain.depth[:, None] * direction, surface=points.position)
+    dark = _blocked(scene, maps, origin + plain.depth[:, None] * direction, surface=points)
     shadowed[:, plain.pixel] = dark
     samples = options.antialias if options.filtering else None
     rgb[plain.pixel] = shade(scene, points, -direction, dark, samples=samples)
@@ -183,12 +185,16 @@ def _blocked(
     maps: list[shadow_map.ShadowMap],
     position: Tensor,
     slack: Tensor | None = None,
-    surface: Tensor | None = None,
+    surface: Points | None = None,
 ) -> Tensor:
     """Return whether each light is blocked at positions; see `shadow_map.blocked`."""
     dark = torch.zeros(len(scene.lights), len(position), dtype=torch.bool)
-    for l, shadow in enumerate(maps):
-        dark[l] = shadow_map.blocked(shadow, position, slack, surface=surface)
+    for l, (light, shadow) in enumerate(zip(scene.lights, maps, strict=False)):
+        above = None
+        if surface is not None:
+            lean = dot(surface.frame.n, illuminate(light, surface.position)[0])
+            above = shadow_map.Above(surface.position, lean)
+        dark[l] = shadow_map.blocked(shadow, position, slack, above=above)
     return dark
 
 

@@ -52,15 +52,27 @@ class ShadowFace(NamedTuple):
         camera: the view.
         triangle: (pixels,) row of `triangles` on which the nearest shadow starts, -1 = none.
         behind: (pixels,) distance from that triangle's plane to where the shadow starts.
-        length: (pixels,) way of the light through the closed body whose back that is; 0 = another surface.
+        front: (pixels,) where the light first enters a closed body that stops it; inf = none does.
         triangles: what was drawn.
     """
 
     camera: Camera
     triangle: Tensor
     behind: Tensor
-    length: Tensor
+    front: Tensor
     triangles: Triangles
+
+
+class Above(NamedTuple):
+    """The surface that positions are seen through.
+
+    Attributes:
+        position: (n, 3) on it.
+        lean: (n,) cosine between its normal and the light.
+    """
+
+    position: Float[Tensor, "n 3"]
+    lean: Float[Tensor, "n"]
 
 
 SLOPE_BIAS, STEEPEST = 2.0, 0.03
@@ -82,19 +94,22 @@ def blocked(
     position: Float[Tensor, "n 3"],
     slack: Float[Tensor, "n"] | None = None,
     *,
-    surface: Float[Tensor, "n 3"] | None = None,
+    above: Above | None = None,
 ) -> Bool[Tensor, "n"]:
     """Return whether the light is blocked at world positions; positions outside the map are lit.
 
     A blocker nearer to a position than its `slack` does not count: in a shell, the GDM itself says what shadows near
     material casts.
 
-    A position in a body deeper than twice its way from the `surface` it is seen through did not get there from that
-    surface's outside: in a crease it has come to lie where the map shows no gap any more. Then the surface decides.
+    Where light enters a body, its front is known: a position deeper in it than twice its way from the surface `above`
+    did not get there from that surface's outside. In a crease it has come to lie where there is no gap any more, and
+    the surface decides. And a surface deeper in a body than its slope explains lies in a gap smaller than a texel, in
+    the dark.
     """
     result = torch.zeros(len(position), dtype=torch.bool)
     deep = torch.zeros_like(result)
-    way = torch.zeros(len(position)) if surface is None else (position - surface).norm(dim=-1)
+    if above is not None:
+        way, enters, slope = (position - above.position).norm(dim=-1), above.lean > 0, _slope(above.lean)
     for face in shadow.faces:
         camera = face.camera
         x_w, y_w, w, depth = camera.project(position).unbind(-1)
@@ -109,16 +124,24 @@ def blocked(
         t = (position[seen] - camera.eye.to(position.dtype)).norm(dim=-1) if perspective else depth[seen]
         start = depth_at(face.triangles, camera, triangle, xy[seen])
         texel = row[seen] * camera.width + column[seen]
-        behind, length = face.behind[texel], face.length[texel]
-        front = start - length - behind  # later by the bias: between centres of texels it is not known better
-        deep[seen] |= (length > 0) & (way[seen] > 0) & (t > front + 2 * way[seen])
-        start = start + behind
+        if above is not None:
+            texels = torch.where(way[seen] > 0, 1, slope[seen]) * (t if perspective else 1.0)
+            deep[seen] |= enters[seen] & (t > face.front[texel] + 2 * way[seen] + camera.pixel_size * texels)
+        start = start + face.behind[texel]
         result[seen] |= t > (start if slack is None else start + slack[seen])
-    if surface is None:
+    if above is None:
         return result
+    result |= deep & (way == 0)
     asked = (deep & ~result).nonzero()[:, 0]
-    result[asked] = blocked(shadow, surface[asked])
+    if len(asked):  # once: a surface is nothing's inside
+        result[asked] = blocked(shadow, above.position[asked], above=Above(above.position[asked], above.lean[asked]))
     return result
+
+
+def _slope(cosine: Tensor) -> Tensor:
+    """Return how far along the light, in texels, a surface may lie from where the centre of its texel shows it."""
+    steep = cosine.clamp(min=STEEPEST)
+    return 1 + SLOPE_BIAS * (1 - steep.square()).clamp(min=0).sqrt() / steep
 
 
 def _draw(scene: Scene, world: World, camera: Camera, silhouette: Silhouette) -> ShadowFace:
@@ -134,10 +157,9 @@ def _draw(scene: Scene, world: World, camera: Camera, silhouette: Silhouette) ->
     cosine = dot(points.frame.n, -direction)
     corner = world.vertices[world.faces[layers.triangles.face[layers.triangle[surface]]]]
     facet = normalize(torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]))
-    steep = dot(facet, direction).abs().clamp(min=STEEPEST)
     t = layers.t[surface]
     texel = camera.pixel_size * (t if camera.projection == "perspective" else torch.ones_like(t))
-    bias = texel * (1 + SLOPE_BIAS * (1 - steep.square()).clamp(min=0).sqrt() / steep)
+    bias = texel * _slope(dot(facet, direction).abs())
 
     # Closed: a little before the back, so that the far side of a body is in its own shadow, but not before the middle.
     inside = -torch.minimum(bias, (t - candidates.t) / 2)
@@ -150,11 +172,11 @@ def _draw(scene: Scene, world: World, camera: Camera, silhouette: Silhouette) ->
     first = nearest(candidates, t + behind)
     n_pixel = camera.width * camera.height
     triangle = torch.full((n_pixel,), -1)
-    offset, length = torch.zeros(2, n_pixel, dtype=behind.dtype)
+    offset, front = torch.zeros(n_pixel, dtype=behind.dtype), torch.full((n_pixel,), torch.inf, dtype=behind.dtype)
     triangle[candidates.pixel[first]] = layers.triangle[surface[first]]
     offset[candidates.pixel[first]] = behind[first]
-    length[candidates.pixel[first]] = torch.where(closed, t - candidates.t, 0)[first]
-    return ShadowFace(camera, triangle, offset, length, layers.triangles)
+    front.scatter_reduce_(0, candidates.pixel[closed], candidates.t[closed].to(front.dtype), "amin")
+    return ShadowFace(camera, triangle, offset, front, layers.triangles)
 
 
 def sizes(light: Light, size: int) -> list[int]:
