@@ -218,10 +218,14 @@ def _rotate_opencl(c: Tensor, rotation: Tensor, degree: int) -> Tensor:
 
 @lru_cache(maxsize=8)
 def _quarter_turn_on_device(degree: int) -> "opencl.Buffer":
-    """Return J's blocks for l = 0, 1, ..., one behind the other."""
+    return opencl.upload(quarter_turn_blocks(degree))
+
+
+def quarter_turn_blocks(degree: int) -> Float32[np.ndarray, "number"]:
+    """Return what kernels need to rotate: J's blocks for l = 0, 1, ..., one behind the other."""
     J = _quarter_turn(degree).float()
     blocks = [J[l * l : (l + 1) ** 2, l * l : (l + 1) ** 2].flatten() for l in range(degree + 1)]
-    return opencl.upload(torch.cat(blocks).numpy())
+    return torch.cat(blocks).numpy()
 
 
 def mirror_y(c: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n"]:

@@ -96,6 +96,9 @@ class Renderer:
             ("-DQUILTED", self._on_device.materials.quilted),
             ("-DGDM", self._on_device.shells is not None),
         )
+        distant = self._on_device.distant
+        self._distant = ("-DDISTANT",) if distant else ()
+        self._distant += ("-DTRANSFER",) if distant and distant.field else ()
         self._defines = (f"-DSILHOUETTE={mode}", *(name for name, needed in wanted if needed))
         self._plain = mode == 0 and self.options.silhouette != "none"
         self._cull = mode == 0 and self._skips.hidden  # where no surface has depth, faces turned away hide nothing
@@ -313,6 +316,7 @@ class Renderer:
         frame["pitch"] = picture.rgba.shape[1]
         frame["ambient"], frame["background"] = scene.ambient, scene.background
         frame["starts"] = 0
+        frame["distant_degree"] = self._on_device.distant.degree if self._on_device.distant else -1
         for k, start in enumerate(itertools.islice(self._on_device.starts(camera), MOST_STARTS)):
             frame["start_tet"][k], frame["start_surface"][k], frame["start_place"][k, :3] = start
             frame["starts"] = k + 1
@@ -340,8 +344,10 @@ class Renderer:
              geometry.records, geometry.facets, materials.tables, materials.mdfs, materials.reflectances,
              picture.lights.buffer, lights.views, lights.slots, lights.labels, lights.counters, *stored,
              picture.frame.buffer, *self._layers(),
-             *(b for b, _ in picture.results), picture.empty.buffer, *self._on_device.of_shells),
-            (*self._defines, *(["-DSHADOWS"] * self.options.shadows), *(["-DFILTERED"] * self.options.filtering)),
+             *(b for b, _ in picture.results), picture.empty.buffer, *self._on_device.of_shells,
+             *self._on_device.of_distant),
+            (*self._defines, *self._distant, *(["-DSHADOWS"] * self.options.shadows),
+             *(["-DFILTERED"] * self.options.filtering)),
         )  # fmt: skip
 
 
