@@ -347,7 +347,11 @@ class SkyConfig(Strict):
 
 
 class EnvironmentConfig(Strict):
-    """Light from all around: a map or a sky, how it is turned and exposed, and how it lights the scene."""
+    """Light from all around: a map or a sky, how it is turned and exposed, and how it lights the scene.
+
+    `lights` and `sampling` are of the method sampling; `degree` of the others (7, and 5 with transfer), `rays` and
+    `bounces` of transfer.
+    """
 
     map: str | None = None
     sky: SkyConfig | None = None
@@ -356,7 +360,9 @@ class EnvironmentConfig(Strict):
     method: Literal["sampling", "frequency", "transfer"] = "sampling"
     lights: int = Field(default=200, ge=1, le=light_sampling.MOST_LIGHTS)
     sampling: light_sampling.Method = "quadtree"
-    degree: int = Field(default=7, ge=0, le=10)
+    degree: int | None = Field(default=None, ge=0, le=10)
+    rays: int = Field(default=4096, ge=16, le=65536)
+    bounces: int = Field(default=1, ge=0, le=64)
 
     def build(self) -> Environment:
         """Return the environment.

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from tests.pipeline.small import CONTENT, small
-from torchmeso import config
+from torchmeso import cli, config
 from torchmeso.data import image
 from torchmeso.errors import ConfigError, FormatError
 from torchmeso.pipeline import animate, environment, render
@@ -84,6 +84,36 @@ def test_frames_of_a_turning_environment(method, a_map, tmp_path):
     assert not torch.equal(pictures[0], pictures[1])
     shift = [float(p[:, 24:].mean() - p[:, :24].mean()) for p in pictures]
     assert shift[0] > shift[1] + 0.01 or shift[0] > shift[2] + 0.01  # the lamp begins on the right
+
+
+def test_bodies_shadow_each_other_by_transfer_and_are_followed_once(a_map, monkeypatch, tmp_path):
+    monkeypatch.setenv("TORCHMESO_CACHE", str(tmp_path / "cache"))
+    objects = [
+        {"shape": "sphere", "options": {"triangles": 300}, "material": "clay"},
+        {"shape": "plane", "options": {"size": [6, 6], "triangles": 800}, "translate": [0, -1, 0], "material": "clay"},
+    ]
+    settings = {"map": a_map, "degree": 3, "rays": 256, "bounces": 1}
+    with_shadows, without = (
+        small(objects=objects, lights=[], environment={**settings, "method": m}) for m in ("transfer", "frequency")
+    )
+    shadowed, plain = (render.render(c).picture for c in (with_shadows, without))
+    floor = shadowed.owner == 1
+    ratio = shadowed.rgb[floor].mean(-1) / plain.rgb[floor].mean(-1)
+    assert float(ratio.min()) < 0.6 and float(ratio.median()) > 0.75
+    monkeypatch.setattr(environment.transfer, "bake", None)  # a second time it comes from the cache
+    again = built(with_shadows)(0.0).distant
+    assert again.at_vertices is not None
+
+
+def test_environments_from_the_command_line(a_map, tmp_path, capsys):
+    (tmp_path / "a.yaml").write_text(
+        "materials: {clay: {albedo: [0.5, 0.5, 0.5]}}\nobjects: [{shape: sphere, material: clay}]\n"
+        "camera: {eye: [0, 1, 3], width: 32, height: 24}\n"
+    )
+    out = str(tmp_path / "a.exr")
+    for options in (["--env", a_map], ["--env", "sky", "--env-method", "frequency"]):
+        cli.main(["render", str(tmp_path / "a.yaml"), *options, "--out", out, "--force"], standalone_mode=False)
+        assert out in capsys.readouterr().out and float(image.read(out).max()) > 0.05
 
 
 def test_the_sky_needs_no_file():

@@ -35,7 +35,6 @@ from torchmeso.render.device_tables import (
     ring_count,
     ring_records,
 )
-from torchmeso.render.environment import cosine_lobe
 from torchmeso.render.scene import Scene, World
 
 
@@ -90,7 +89,7 @@ def light_table(light: DistantLight) -> Float32[np.ndarray, "number"]:
     """Return the cosine's harmonics, the recurrence, the light's coefficients and J; see environment.clh."""
     n = len(light.coefficients)
     table = np.zeros(384 + 680, np.float32)
-    table[:n] = cosine_lobe(light.degree).numpy()
+    table[:n] = spherical_harmonics.cosine_lobe(light.degree).numpy()
     steps = spherical_harmonics.recurrence(light.degree)
     table[64 : 64 + len(steps)] = steps
     table[128 : 128 + 4 * n] = torch.nn.functional.pad(light.coefficients.float(), (0, 1)).flatten().numpy()

@@ -101,18 +101,11 @@ def _reflect(material: Material, uv: Tensor, wo: Tensor, seen: Footprint | None,
         up = torch.tensor([0.0, 0.0, 1.0], dtype=e.dtype).expand(len(e), 3)
         normal = up if btf is None else btf.normal(uv, seen)
         share = torch.einsum(
-            "nj,j,njc->nc", spherical_harmonics.basis(normal, degree), cosine_lobe(degree).to(e.dtype), e
+            "nj,j,njc->nc",
+            spherical_harmonics.basis(normal, degree),
+            spherical_harmonics.cosine_lobe(degree).to(e.dtype),
+            e,
         )
         return share * (torch.tensor(material.albedo, dtype=e.dtype) if btf is None else btf.colour(uv, seen))
     assert isinstance(btf, Harmonic)
     return torch.einsum("nkc,kj,njc->nc", btf.over_light(uv, wo, seen), btf.against(degree).to(e.dtype), e)
-
-
-def cosine_lobe(degree: int) -> Float[Tensor, "n_e"]:
-    """Return h_l, repeated for every m: the integral of max(cos, 0) y_j around n is h_l y_j(n); float64."""
-    A = spherical_harmonics.hemisphere_matrix(max(degree, 1))
-    # cos theta is a multiple of y_2 = y_(1, 0); of these integrals only those with m = 0 are not 0.
-    zonal = A[2, [l * l + l for l in range(degree + 1)]] * math.sqrt(4 * math.pi / 3)
-    at_pole = torch.tensor([math.sqrt((2 * l + 1) / (4 * math.pi)) for l in range(degree + 1)], dtype=torch.float64)
-    each = zonal / at_pole
-    return torch.cat([each[l].expand(2 * l + 1) for l in range(degree + 1)])
