@@ -360,7 +360,9 @@ def _compare_btf(a: str, b: str, out: str | None, as_json: bool) -> None:
 
 
 @main.command()
-@click.argument("suite", type=click.Choice(["compress", "gdm", "render", "skip", "stability", "synthesize", "tables"]))
+@click.argument(
+    "suite", type=click.Choice(["compress", "gdm", "light", "render", "skip", "stability", "synthesize", "tables"])
+)
 @click.option("--quick", is_flag=True, help="Fewer repetitions and sweep points; never smaller sizes.")
 @click.option("--prepare", is_flag=True, help="Only bake what the suite needs into the cache.")
 @click.option("--only", multiple=True, help="Rows whose id begins with this; may be repeated.")
@@ -368,13 +370,14 @@ def _compare_btf(a: str, b: str, out: str | None, as_json: bool) -> None:
 @click.option("--plot", "plot_path", help="Draw the curves into this picture (.png, .svg).")
 def bench(suite: str, quick: bool, prepare: bool, only: tuple[str, ...], json_path: str | None, plot_path: Any) -> None:
     """Measure SUITE: accuracy against truth, time against peers in the same run."""
-    from torchmeso.bench import colour, compress, frames, gdm, plot, render, skips, stability, tables
+    from torchmeso.bench import colour, compress, frames, gdm, light, plot, render, skips, stability, tables
     from torchmeso.bench import suite as suites
     from torchmeso.bench import synthesize as synthesis
 
     measurements = {
         "compress": compress.MEASUREMENTS,
         "gdm": gdm.MEASUREMENTS,
+        "light": light.MEASUREMENTS,
         "render": render.MEASUREMENTS,
         "skip": skips.MEASUREMENTS,
         "stability": stability.MEASUREMENTS,
