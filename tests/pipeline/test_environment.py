@@ -7,7 +7,7 @@ from tests.pipeline.small import CONTENT, small
 from torchmeso import cli, config
 from torchmeso.data import image
 from torchmeso.errors import ConfigError, FormatError
-from torchmeso.pipeline import animate, environment, render
+from torchmeso.pipeline import animate, environment, render, truth
 from torchmeso.pipeline import scene as scenes
 from torchmeso.pipeline.bake import prepare
 
@@ -114,6 +114,14 @@ def test_environments_from_the_command_line(a_map, tmp_path, capsys):
     for options in (["--env", a_map], ["--env", "sky", "--env-method", "frequency"]):
         cli.main(["render", str(tmp_path / "a.yaml"), *options, "--out", out, "--force"], standalone_mode=False)
         assert out in capsys.readouterr().out and float(image.read(out).max()) > 0.05
+
+
+def test_the_truth_is_lit_by_the_environment_too(a_map, monkeypatch, tmp_path):
+    monkeypatch.setenv("TORCHMESO_CACHE", str(tmp_path / "cache"))
+    settings = clay(map=a_map, lights=100)
+    exact, picture = truth.render(settings).rgb, render.render(settings).picture
+    seen = picture.owner == 0
+    assert float((picture.rgb[seen] - exact[seen]).abs().mean() / exact[seen].mean()) < 0.05
 
 
 def test_the_sky_needs_no_file():

@@ -140,6 +140,6 @@ def _over_light(pool: Pool, btf: EigenBtf) -> np.ndarray:
     record["maps"] = pool.add(in_groups(torch.cat([x.flatten(0, 1) for x in levels])).numpy())
     record["levels"], record["level_count"] = pool.add(rows), len(levels)
     record["scale"], record["offset"] = (pool.add(in_groups(x).contiguous().numpy()) for x in (scale, offset))
-    record["against"] = pool.add(by_order(torch.eye(H.shape[1])))
+    record["light_rings"] = pool.add(by_order(torch.eye(H.shape[1])))
     record["quilt"] = -1 if btf.quilting is None else add_quilt(pool, btf.quilting)
     return record

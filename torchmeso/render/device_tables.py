@@ -48,7 +48,7 @@ REFLECTANCE = np.dtype(
     + [("last_cosine", "f4"), ("albedo", "f4", 3)]
     + [(name, "i4") for name in ("normals", "normal_levels", "normal_level_count")]
     + [(name, "i4") for name in ("light_steps", "light_degree", "view_steps", "view_degree")]
-    + [("view_last_cosine", "f4"), ("view_edges", "i4"), ("quilt", "i4"), ("against", "i4")]
+    + [("view_last_cosine", "f4"), ("view_edges", "i4"), ("quilt", "i4")]
 )
 EIGEN, TEXTURED, HARMONIC, HARMONIC_PCA = 1, 2, 3, 4
 """What stands in a reflectance's `there`; 0 = a plain colour."""
@@ -82,7 +82,6 @@ ADDRESSES = {
         "view_steps",
         "view_edges",
         "quilt",
-        "against",
     ),
     MDF: ("rings", "delta", "missing", "relief", "plateau", "hole", "quilt"),
 }
@@ -284,7 +283,7 @@ def _harmonics(pool: "Pool", btf: ShBtf) -> np.ndarray:
         record[f"{side}_steps"] = pool.add(spherical_harmonics.recurrence(degree))
         record[f"{side}_degree"] = degree
     record["last_cosine"], record["view_last_cosine"] = math.cos(btf.lights.last), math.cos(btf.views.last)
-    record["against"] = pool.add(by_order(btf.against(MOST_DISTANT)))
+    record["light_rings"] = pool.add(by_order(btf.against(MOST_DISTANT)))
     return record
 
 
@@ -316,7 +315,7 @@ def _harmonic_components(pool: "Pool", btf: ShPcaBtf) -> np.ndarray:
     degree = spherical_harmonics.degree_of(btf.terms)
     record["light_steps"], record["light_degree"] = pool.add(spherical_harmonics.recurrence(degree)), degree
     record["last_cosine"] = math.cos(btf.lights.last)
-    record["against"] = pool.add(by_order(btf.against(MOST_DISTANT)))
+    record["light_rings"] = pool.add(by_order(btf.against(MOST_DISTANT)))
     return record
 
 
