@@ -189,13 +189,13 @@ def bands(context: Context) -> Iterator[Row]:
 
 
 def _unshadowed(points: Points, w: Tensor, E: Tensor) -> Tensor:
-    some = Points(*(x[::8] if isinstance(x, Tensor) else x for x in points))
+    wo = points.wo[::8, None]
     frame, material = frames.Frame(*(x[::8] for x in points.frame)), Reflectance(*(x[::8] for x in points.material))
-    total = torch.zeros(len(some.origin), 3, dtype=torch.float64)
+    total = torch.zeros(len(wo), 3, dtype=torch.float64)
     for part, power in zip(w.float().split(4096), E.split(4096), strict=True):
         wide = frames.Frame(*(x[:, None].expand(-1, len(part), 3) for x in frame))
         wi = frames.to_local(wide, part.expand(len(total), -1, -1))
-        f = materials.evaluate(material, wi, some.wo[:, None]) * wi[..., 2:].clamp(min=0)
+        f = materials.evaluate(material, wi, wo) * wi[..., 2:].clamp(min=0)
         total += torch.einsum("nlc,lc->nc", f.double(), power.double())
     return total
 

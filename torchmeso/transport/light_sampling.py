@@ -132,11 +132,11 @@ def _joined(moments: Float[Tensor, "n 7"], w: Float[Tensor, "n 3"], count: int) 
         way = (w - w[i]).norm(dim=1) * L * L[i] / (L + L[i])
         return way.masked_fill(~alive, math.inf).index_fill(0, torch.tensor([i]), math.inf)
 
-    surplus = len(w) - count
-    if surplus > 0:
-        table = torch.stack([ways(i) for i in range(len(w))])
-        shortest, partner = table.min(1)
-    for _ in range(surplus):
+    if len(w) <= count:
+        return w, moments[:, :3]
+    table = torch.stack([ways(i) for i in range(len(w))])
+    shortest, partner = table.min(1)
+    for _ in range(len(w) - count):
         i = int(shortest.argmin())
         j = int(partner[i])
         moments[i] += moments[j]
