@@ -50,7 +50,7 @@ def test_cube_and_lat_long_agree_on_a_smooth_function():
         radiance=shine(flat.texels().directions).float().reshape(64, 128, 1).expand(-1, -1, 3), rotation=torch.eye(3)
     )
     cube = Environment(radiance=cube_of(shine, 32), layout="cube", rotation=torch.eye(3))
-    torch.testing.assert_close(flat.harmonics(2), cube.harmonics(2), rtol=0, atol=2e-3)  # measured 8e-4
+    torch.testing.assert_close(flat.harmonics(2), cube.harmonics(2), rtol=0, atol=1e-2)  # measured 1.4e-3
 
 
 def test_harmonics_of_a_turned_map_are_the_turned_harmonics(rng):
@@ -59,7 +59,7 @@ def test_harmonics_of_a_turned_map_are_the_turned_harmonics(rng):
     R = turn_about_x(0.7)
     turned = Environment(radiance=radiance, rotation=R, exposure=1.0)
     wanted = 2 * spherical_harmonics.rotate(still.harmonics(4).mT, R.double()).mT
-    torch.testing.assert_close(turned.harmonics(4), wanted, rtol=1e-6, atol=1e-6)  # measured 1e-7: a float32 rotation
+    torch.testing.assert_close(turned.harmonics(4), wanted, rtol=1e-6, atol=1e-6)  # a float32 rotation
 
 
 @pytest.mark.parametrize("shape", list(FACES))

@@ -108,7 +108,7 @@ def test_radiance_is_the_integral_of_btf_and_light(kind, degree, rng):
     wanted = integrated(material, p, wo, e)
     assert bool((wanted > 0).any())
     kept = wanted > 0
-    torch.testing.assert_close(found[kept], wanted[kept], rtol=1e-4, atol=1e-4)  # measured 2e-5: brute force's own
+    torch.testing.assert_close(found[kept], wanted[kept], rtol=1e-4, atol=1e-4)  # measured 4e-6: brute force's own
 
 
 def object_of(material):
@@ -167,7 +167,7 @@ def test_the_frame_on_opencl_is_that_of_torch(kind, degree, followed, rng, devic
     same = (exact.owner == 0) & (fast.owner == 0)
     assert int(same.sum()) > 500
     error = (exact.rgb - fast.rgb.double())[same].abs().amax(-1)
-    assert float(error.quantile(0.99)) < 2e-4 * float(exact.rgb.max())  # measured 2e-5; pixels of seams differ
+    assert float(error.quantile(0.99)) < 2e-5 * float(exact.rgb.max())  # measured 2e-6; pixels of seams differ
 
 
 def test_another_light_replaces_the_one_before(rng, device):

@@ -47,7 +47,7 @@ def test_quads_have_equal_areas_and_places_on_them_go_back_and_forth(rng):
     w = torch.cat([on_the_sphere(60_000, rng), torch.eye(3, dtype=torch.float64), -torch.eye(3, dtype=torch.float64)])
     quad, x, y = to_quads(w)
     back = from_quads(quad, x, y)
-    assert float((back - w).norm(dim=1).max()) < 1e-7  # measured 1e-8, at the poles
+    assert float((back - w).norm(dim=1).max()) < 1e-12  # measured 8e-14
     cells = torch.bincount((quad * 2 + (x * 2).long().clamp(max=1)) * 2 + (y * 2).long().clamp(max=1), minlength=48)
     expected = len(w) / 48
     assert float(((cells - expected) ** 2 / expected).sum()) < 47 + 4 * math.sqrt(2 * 47)
@@ -99,7 +99,7 @@ def test_a_small_turn_of_the_map_changes_the_picture_little(rng):
         pictures.append(diffuse(directions(t, 100), normals))
         exact.append(diffuse((t.directions, t.solid_angle[:, None] * t.radiance), normals))
     steps, wanted = (torch.stack(x).diff(dim=0).square().mean().sqrt() for x in (pictures, exact))
-    assert float(steps / wanted) < 1.1  # measured 1.004
+    assert float(steps / wanted) < 1.1  # measured 1.036
 
 
 def test_joining_keeps_luminance_and_its_centre(rng):
