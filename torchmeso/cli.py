@@ -165,14 +165,22 @@ main.add_command(tile)
 @click.argument("configuration")
 @click.option("--silhouette", type=click.Choice(["none", "paper", "curved"]), help="Overrides the configuration.")
 @click.option("--backend", type=click.Choice(["auto", "torch", "opencl"]), help="Overrides the configuration [auto].")
+@click.option(
+    "--env", help="A map (.hdr, .exr, .pfm; lat-long or cube) or 'sky', in place of lights and ambient light."
+)
+@click.option(
+    "--env-method",
+    type=click.Choice(["sampling", "frequency", "transfer"]),
+    help="As directional lights, as harmonics without shadows between bodies, or with them [sampling].",
+)
 @click.option("--frames", type=int, help="Frames of one whole turn, to .png (a sequence), .gif or .mp4.")
 @click.option(
     "--path",
     "way",
-    type=click.Choice(["turntable", "light"]),
+    type=click.Choice(["turntable", "light", "environment"]),
     default="turntable",
     show_default=True,
-    help="With --frames, what turns: the camera around the subject, or the lights.",
+    help="With --frames, what turns: the camera around the subject, the lights, or the environment.",
 )
 @click.option("--fps", default=25.0, show_default=True, help="Frames per second of .gif and .mp4.")
 @click.option("--out", required=True, help="Picture: .png (sRGB) or .exr (linear, with depth); film: .gif, .mp4.")
@@ -183,6 +191,8 @@ def render(
     configuration: str,
     silhouette: Any,
     backend: Any,
+    env: str | None,
+    env_method: Any,
     frames: int | None,
     way: Any,
     fps: float,
@@ -203,6 +213,8 @@ def render(
         settings = config.with_silhouette(settings, silhouette)
     if backend is not None:
         settings = settings.model_copy(update={"backend": backend})
+    if env is not None or env_method is not None:
+        settings = config.with_environment(settings, env, env_method)
     if frames is not None:
         _render_frames(settings, out, truth, force, {"frames": frames, "way": way, "fps": fps})
         return
@@ -348,7 +360,9 @@ def _compare_btf(a: str, b: str, out: str | None, as_json: bool) -> None:
 
 
 @main.command()
-@click.argument("suite", type=click.Choice(["compress", "gdm", "render", "skip", "stability", "synthesize", "tables"]))
+@click.argument(
+    "suite", type=click.Choice(["compress", "gdm", "light", "render", "skip", "stability", "synthesize", "tables"])
+)
 @click.option("--quick", is_flag=True, help="Fewer repetitions and sweep points; never smaller sizes.")
 @click.option("--prepare", is_flag=True, help="Only bake what the suite needs into the cache.")
 @click.option("--only", multiple=True, help="Rows whose id begins with this; may be repeated.")
@@ -356,13 +370,14 @@ def _compare_btf(a: str, b: str, out: str | None, as_json: bool) -> None:
 @click.option("--plot", "plot_path", help="Draw the curves into this picture (.png, .svg).")
 def bench(suite: str, quick: bool, prepare: bool, only: tuple[str, ...], json_path: str | None, plot_path: Any) -> None:
     """Measure SUITE: accuracy against truth, time against peers in the same run."""
-    from torchmeso.bench import colour, compress, frames, gdm, plot, render, skips, stability, tables
+    from torchmeso.bench import colour, compress, frames, gdm, light, plot, render, skips, stability, tables
     from torchmeso.bench import suite as suites
     from torchmeso.bench import synthesize as synthesis
 
     measurements = {
         "compress": compress.MEASUREMENTS,
         "gdm": gdm.MEASUREMENTS,
+        "light": light.MEASUREMENTS,
         "render": render.MEASUREMENTS,
         "skip": skips.MEASUREMENTS,
         "stability": stability.MEASUREMENTS,

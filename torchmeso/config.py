@@ -22,11 +22,13 @@ from torchmeso.compress.sh_pca import ShPcaOptions
 from torchmeso.config_sections import (
     CameraConfig,
     Config,
+    EnvironmentConfig,
     MaterialConfig,
     MesoConfig,
     ObjectConfig,
     PlaceConfig,
     RegionConfig,
+    SkyConfig,
     SpotConfig,
     TruthConfig,
     first_problem,
@@ -105,13 +107,35 @@ def with_silhouette(config: Config, silhouette: Silhouette) -> Config:
     return config.model_copy(update={"render": replace(config.render, silhouette=silhouette)})
 
 
+def with_environment(config: Config, source: str | None, method: str | None) -> Config:
+    """Return `config` under another environment, in place of its lights and ambient light, or by another method.
+
+    Args:
+        config: what is lit.
+        source: a map, or 'sky'; None = the configuration's own.
+        method: sampling, frequency or transfer; None = as it is.
+
+    Raises:
+        ConfigError: there is no environment whose method could be another.
+    """
+    if source is None and config.environment is None:
+        raise ConfigError("render: --env-method needs an environment; name one with --env F, or --env sky")
+    changes: dict[str, Any] = {} if method is None else {"method": method}
+    if source is None:
+        assert config.environment is not None
+        return config.model_copy(update={"environment": config.environment.model_copy(update=changes)})
+    light = {"sky": {}} if source == "sky" else {"map": _absolute(source, Path())}
+    update = {"environment": EnvironmentConfig.model_validate({**light, **changes}), "lights": [], "ambient": 0.0}
+    return config.model_copy(update=update)
+
+
 def data_dir() -> Path:
     """Return the folder `data:` stands for: TORCHMESO_DATA, else shared/data beside the checkout."""
     beside = Path(__file__).resolve().parents[2] / "shared" / "data"
     return Path(os.environ.get("TORCHMESO_DATA", beside))
 
 
-PATH_KEYS = ("mesh", "model", "displacement", "albedo", "albedo_map", "normal_map", "path", "quilting")
+PATH_KEYS = ("map", "mesh", "model", "displacement", "albedo", "albedo_map", "normal_map", "path", "quilting")
 
 
 def _resolve(content: Any, folder: Path) -> Any:
@@ -155,6 +179,8 @@ def _fields(kind: Any) -> dict[str, Any]:
         "regions": RegionConfig,
         "unwrap": UnwrapOptions,
         "camera": CameraConfig,
+        "environment": EnvironmentConfig,
+        "sky": SkyConfig,
         "render": FrameOptions,
         "truth": TruthConfig,
         "btf": BtfOptions,

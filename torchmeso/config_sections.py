@@ -7,6 +7,7 @@ Test: tests/test_config.py
 
 import inspect
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -17,6 +18,9 @@ from torchmeso.backends import BackendChoice
 from torchmeso.compress.double_sh import DoubleShOptions
 from torchmeso.compress.eigen import EigenOptions
 from torchmeso.compress.sh_pca import ShPcaOptions
+from torchmeso.data import environment as environments
+from torchmeso.data import sky as skies
+from torchmeso.data.environment import Environment
 from torchmeso.errors import ConfigError, MesoError, did_you_mean
 from torchmeso.geometry.camera import Camera, look_at
 from torchmeso.geometry.light import DirectionalLight, Light, PointLight, SpotLight
@@ -31,6 +35,7 @@ from torchmeso.meso.mesostructure import Mesostructure, Rgb
 from torchmeso.meso.sources import SOURCES
 from torchmeso.render.frame import FrameOptions
 from torchmeso.render.scene import ShellOptions
+from torchmeso.transport import light_sampling
 
 Vector = tuple[float, float, float]
 
@@ -333,6 +338,48 @@ class CameraConfig(Strict):
         return Camera(eye=place, axes=axes, **rest)
 
 
+class SkyConfig(Strict):
+    """The built-in sky; see `data.sky`."""
+
+    elevation_deg: float = 45.0
+    azimuth_deg: float = 30.0
+    turbidity: float = 3.0
+
+
+class EnvironmentConfig(Strict):
+    """Light from all around: a map or a sky, how it is turned and exposed, and how it lights the scene.
+
+    `lights` and `sampling` are of the method sampling; `degree` of the others (7, and 5 with transfer), `rays` and
+    `bounces` of transfer.
+    """
+
+    map: str | None = None
+    sky: SkyConfig | None = None
+    rotate_deg: Vector = (0.0, 0.0, 0.0)
+    exposure: float = 0.0
+    method: Literal["sampling", "frequency", "transfer"] = "sampling"
+    lights: int = Field(default=200, ge=1, le=light_sampling.MOST_LIGHTS)
+    sampling: light_sampling.Method = "quadtree"
+    degree: int | None = Field(default=None, ge=0, le=10)
+    rays: int = Field(default=4096, ge=16, le=65536)
+    bounces: int = Field(default=1, ge=0, le=64)
+
+    def build(self) -> Environment:
+        """Return the environment.
+
+        Raises:
+            MesoError: the map is missing or unreadable, or an argument is out of range.
+        """
+        if (self.map is None) == (self.sky is None):
+            raise ConfigError("environment: expected a map or a sky, got both or none; name one of them")
+        if self.map is not None:
+            found = environments.read(self.map)
+        else:
+            found = skies.build(**(self.sky or SkyConfig()).model_dump())
+        rotation = PlaceConfig(rotate_deg=self.rotate_deg).matrix()[:3, :3]
+        return replace(found, rotation=rotation.float(), exposure=self.exposure)
+
+
 class TruthConfig(Strict):
     """How the ray-traced truth is made: paths per pixel, bounces, and the longest edge of displaced triangles."""
 
@@ -351,10 +398,19 @@ class Config(Strict):
     ambient: float = Field(default=0.05, ge=0)
     ambient_rule: Literal["add", "paper"] = "add"
     background: Vector = (0.0, 0.0, 0.0)
+    environment: EnvironmentConfig | None = None
     camera: CameraConfig
     backend: BackendChoice = "auto"
     render: FrameOptions = Field(default_factory=FrameOptions)
     truth: TruthConfig = Field(default_factory=TruthConfig)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _light_of_all_around(cls, content: Any) -> Any:
+        """Light from an environment takes the place of ambient light, unless that is asked for."""
+        if isinstance(content, dict) and content.get("environment") is not None and "ambient" not in content:
+            return {**content, "ambient": 0.0}
+        return content
 
     @model_validator(mode="after")
     def _check(self) -> "Config":

@@ -3,7 +3,8 @@
 //
 // Compiled with SILHOUETTE and MIXED (see silhouette.clh), ONE_LAYER, SHADOWS where lights have maps, FILTERED where
 // pixels average what they cover, HARMONICS where there are double-SH or SH + PCA BTFs, QUILTED where there
-// are quilting maps, and GDM where there are shells.
+// are quilting maps, GDM where there are shells, DISTANT where light comes from all around, and TRANSFER where that was
+// followed to the vertices.
 
 #include "render/look.clh"
 
@@ -23,10 +24,10 @@ static INNER void draw_tiles(const int worker, __global const View *restrict vie
                              __global int16 *restrict slot, __global uchar4 *restrict shown,
                              __global float4 *restrict rgba, __global float *restrict depth,
                              __global int *restrict owner, __global uchar *restrict shadowed,
-                             __global uchar *restrict empty SHELL_PARAMETERS)
+                             __global uchar *restrict empty SHELL_PARAMETERS DISTANT_PARAMETERS)
 {
     const Place place = {view, slots, labels, records, facets, tables, mdfs, counters->near_bodies, 1,
-                         frame->skips SHELL_PLACE};
+                         frame->skips SHELL_PLACE DISTANT_PLACE};
     const Shadows shadows = {light_views, light_slots, light_labels, light_counters,
                              passages, kept_key, kept_slot, blockers};
     const Target target = {frame, reflectances, lights, shadows, shown, rgba, depth, owner, shadowed};
@@ -103,9 +104,9 @@ void draw(__global const View *restrict view, __global const Triangle *restrict 
           __global int *restrict owner,        // (H, pitch)
           __global uchar *restrict shadowed,   // (light, H, pitch)
           __global uchar *restrict empty       // (stamps) whether a stamp already shows the background
-          SHELL_PARAMETERS)
+          SHELL_PARAMETERS DISTANT_PARAMETERS)
 {
     draw_tiles(get_group_id(0), view, triangles, slots, labels, boxes, coarse, counters, records, facets, tables,
                mdfs, reflectances, lights, light_views, light_slots, light_labels, light_counters, passages, kept_key,
-               kept_slot, blockers, frame, key, slot, shown, rgba, depth, owner, shadowed, empty SHELL_ARGUMENTS);
+               kept_slot, blockers, frame, key, slot, shown, rgba, depth, owner, shadowed, empty SHELL_ARGUMENTS DISTANT_ARGUMENTS);
 }

@@ -17,7 +17,7 @@ def test_structures_have_the_kernels_sizes():
 
 
 def test_tables_stand_on_blocks_of_64_bytes():
-    pool = device_tables._Pool()
+    pool = device_tables.Pool()
     arrays = [np.arange(n, dtype=np.float32) for n in (3, 16, 17, 1)]
     blocks = [pool.add(x) for x in arrays]
     whole = pool.joined()

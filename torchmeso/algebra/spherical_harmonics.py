@@ -163,6 +163,16 @@ def hemisphere_matrix(degree: int) -> Float[Tensor, "n n"]:
     return (A + A.mT) / 2
 
 
+def cosine_lobe(degree: int) -> Float[Tensor, "n"]:
+    """Return h_l, repeated for every m: the integral of max(cos, 0) y_j around n is h_l y_j(n); float64."""
+    A = hemisphere_matrix(max(degree, 1))
+    # cos theta is a multiple of y_2 = y_(1, 0); of these integrals only those with m = 0 are not 0.
+    zonal = A[2, [l * l + l for l in range(degree + 1)]] * math.sqrt(4 * math.pi / 3)
+    at_pole = torch.tensor([math.sqrt((2 * l + 1) / (4 * math.pi)) for l in range(degree + 1)], dtype=torch.float64)
+    each = zonal / at_pole
+    return torch.cat([each[l].expand(2 * l + 1) for l in range(degree + 1)])
+
+
 def project(
     f: Float[Tensor, "*batch sample"], w: Float[Tensor, "sample 3"], solid_angle: Float[Tensor, "sample"], degree: int
 ) -> Float[Tensor, "*batch n"]:
@@ -218,10 +228,14 @@ def _rotate_opencl(c: Tensor, rotation: Tensor, degree: int) -> Tensor:
 
 @lru_cache(maxsize=8)
 def _quarter_turn_on_device(degree: int) -> "opencl.Buffer":
-    """Return J's blocks for l = 0, 1, ..., one behind the other."""
+    return opencl.upload(quarter_turn_blocks(degree))
+
+
+def quarter_turn_blocks(degree: int) -> Float32[np.ndarray, "number"]:
+    """Return what kernels need to rotate: J's blocks for l = 0, 1, ..., one behind the other."""
     J = _quarter_turn(degree).float()
     blocks = [J[l * l : (l + 1) ** 2, l * l : (l + 1) ** 2].flatten() for l in range(degree + 1)]
-    return opencl.upload(torch.cat(blocks).numpy())
+    return torch.cat(blocks).numpy()
 
 
 def mirror_y(c: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n"]:

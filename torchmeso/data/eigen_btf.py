@@ -12,13 +12,15 @@ Test: tests/data/test_eigen_btf.py
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 
+import numpy as np
 import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor
 
+from torchmeso.algebra import spherical_harmonics
 from torchmeso.data import address, code_stream, mdf, model_writer, pyramid, store
 from torchmeso.data.btf import horizon_falloff
 from torchmeso.data.mdf import Mdf
@@ -26,7 +28,11 @@ from torchmeso.data.pyramid import Footprint
 from torchmeso.data.quilting_map import QuiltingMap
 from torchmeso.errors import FormatError, ShapeError, check_finite, check_shape
 from torchmeso.geometry import hemisphere, kriging
+from torchmeso.geometry.directions import from_angles
 from torchmeso.geometry.hemisphere import DirectionSet
+
+AROUND = 720
+"""Steps around the pole in integrals of what is interpolated between directions."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -134,6 +140,17 @@ class EigenBtf:
 
         return self._weighted(pyramid.average(look_up, uv, seen, *self._size, most=1), wo)
 
+    def over_light(
+        self, uv: Float[Tensor, "n 2"], wo: Float[Tensor, "n 3"], seen: Footprint | None = None
+    ) -> Float[Tensor, "n light 3"]:
+        """Return T(uv, w_l, wo) at all directions of light; `against` says what each is worth in a light."""
+        directions = self.lights.directions(wo.dtype)
+        return torch.stack([self.evaluate(uv, wi.expand(len(uv), 3), wo, seen) for wi in directions], 1)
+
+    def against(self, degree: int) -> Float[Tensor, "light n"]:
+        """Return, of each harmonic of distant light, what each direction's share of T reflects, times pi."""
+        return hats_against(self.lights, degree)
+
     def view_weights(self, wo: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch rank"]:
         """Return W(wo), interpolated on a finer set than was measured."""
         view = hemisphere.interpolate(self.fine_weights[0], wo)
@@ -180,6 +197,30 @@ class EigenBtf:
         for l in range(len(self.lights)):
             total += share[l] * _decode(self.maps[l], self.scale, self.offset)
         return pyramid.build(total, 0)
+
+
+@lru_cache(maxsize=16)
+def hats_against(lights: DirectionSet, degree: int) -> Float[Tensor, "light n"]:
+    """Return H_lj = integral over the hemisphere of direction l's share of the interpolated T times y_j; float64.
+
+    With the fall-off below the last ring. Gauss points between rings, many equal steps around.
+    """
+    edges = torch.cat([hemisphere.rings(lights).theta, torch.tensor([math.pi / 2], dtype=torch.float64)])
+    nodes, shares = (torch.from_numpy(x) for x in np.polynomial.legendre.leggauss(degree + 6))
+    low, high = edges[:-1, None], edges[1:, None]
+    theta = (low + (nodes + 1) / 2 * (high - low)).reshape(-1)
+    weight = (shares / 2 * (high - low)).reshape(-1) * theta.sin() * (2 * math.pi / AROUND)
+    phi = (torch.arange(AROUND, dtype=torch.float64) + 0.5) * (2 * math.pi / AROUND)
+    H = torch.zeros(lights.n_nodes, spherical_harmonics.size(degree), dtype=torch.float64)
+    for angle, part in zip(theta, weight, strict=True):
+        w = from_angles(angle.expand(AROUND), phi)
+        found = hemisphere.interpolate(lights, w)
+        y = part * horizon_falloff(lights, w) * spherical_harmonics.basis(w, degree)
+        H.index_add_(0, found.node.flatten(), (found.weight[..., None] * y[:, None]).flatten(0, 1))
+    if lights.needs_pole:  # the mean of the first ring
+        first = lights.count[0]
+        H[:first] += H[-1] / first
+    return H[: len(lights)]
 
 
 def _decode(codes: Tensor, scale: Tensor, offset: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Pictures on disk: PNG, JPEG, TIFF (sRGB), OpenEXR and Radiance (linear), as linear RGB float tensors, row 0 on top.
+"""Pictures on disk: PNG, JPEG, TIFF (sRGB), OpenEXR, Radiance, PFM (linear), as linear RGB tensors, row 0 on top.
 
 Test: tests/data/test_image.py
 """
@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from torchmeso.data import rgbe, store
+from torchmeso.data import pfm, rgbe, store
 from torchmeso.data.store import replacing
 from torchmeso.errors import FormatError, StorageError
 
@@ -25,7 +25,7 @@ EXR_PIXELS_PER_BYTE = 1032
 
 
 def read(path: str | Path | bytes) -> Float[Tensor, "H W 3"]:
-    """Return a colour picture as linear RGB; PNG, JPEG and TIFF are taken as sRGB, EXR and Radiance (.hdr) as linear.
+    """Return a colour picture as linear RGB; PNG, JPEG and TIFF are taken as sRGB, EXR, .hdr and PFM as linear.
 
     Args:
         path: of the file; or the content of a PNG or JPEG file.
@@ -37,6 +37,8 @@ def read(path: str | Path | bytes) -> Float[Tensor, "H W 3"]:
         return _read_exr(Path(path))
     if not isinstance(path, bytes) and Path(path).suffix.lower() == ".hdr":
         return torch.from_numpy(rgbe.read(path))
+    if not isinstance(path, bytes) and Path(path).suffix.lower() == ".pfm":
+        return torch.from_numpy(pfm.read(path))
     return decode_codes(torch.from_numpy(_read_pillow(path, colour=True)))
 
 

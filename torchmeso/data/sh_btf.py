@@ -15,7 +15,7 @@ Test: tests/data/test_sh_btf.py
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 
 import torch
@@ -116,6 +116,17 @@ class ShBtf:
         light = self.everywhere.to(wo.dtype).expand(*wo.shape[:-1], -1)
         return self._summed(uv, light, wo, seen, most=1)
 
+    def over_light(
+        self, uv: Float[Tensor, "n 2"], wo: Float[Tensor, "n 3"], seen: Footprint | None = None
+    ) -> Float[Tensor, "n k_l 3"]:
+        """Return c_rho(uv, wo), T's coefficients over the light; `against` says what they are worth in a light."""
+        each = torch.eye(self.terms[0], dtype=wo.dtype)
+        return torch.stack([self._summed(uv, light.expand(len(uv), -1), wo, seen) for light in each], 1)
+
+    def against(self, degree: int) -> Float[Tensor, "k_l n"]:
+        """Return A: what T's coefficients reflect, times pi, of each harmonic of distant light; see `basis_against`."""
+        return basis_against(self.lights, self.terms[0], degree)
+
     def decoded(self) -> Float[Tensor, "k_l k_v H W 3"]:
         """Return the coefficients C as floating-point values."""
         codes = self.maps.to(self.scale.dtype)
@@ -171,6 +182,19 @@ def basis_everywhere(lights: DirectionSet, terms: int) -> Float[Tensor, "n"]:
     """Return each harmonic of the light, held and falling off below the last ring, over the hemisphere and pi."""
     w, weight = _hemisphere_points(lights.last, degree_of(terms))
     return (weight / math.pi) @ (held_basis(lights, w, terms) * horizon_falloff(lights, w))
+
+
+@lru_cache(maxsize=16)
+def basis_against(lights: DirectionSet, terms: int, degree: int) -> Float[Tensor, "n_l n"]:
+    """Return A_ij = integral over the hemisphere of y_i, held and falling off as in `evaluate`, times y_j; float64.
+
+    leung2007tileable, eq. (2). Where the last ring lies on the horizon it is the matrix of plain harmonics; below, T is
+    another function than they are, and this one integrates it. It is the same for coefficients of a hemisphere's fit
+    and of a sphere's projection, because `evaluate` reads both on the upper hemisphere alone.
+    """
+    w, weight = _hemisphere_points(lights.last, max(degree_of(terms), degree))
+    T = held_basis(lights, w, terms) * horizon_falloff(lights, w)
+    return T.mT @ (weight[:, None] * basis(w, degree))
 
 
 def _hemisphere_points(last: float, degree: int) -> tuple[Tensor, Tensor]:

@@ -29,7 +29,7 @@ from torchmeso.data.btf import horizon_falloff
 from torchmeso.data.mdf import Mdf
 from torchmeso.data.pyramid import Footprint
 from torchmeso.data.quilting_map import QuiltingMap
-from torchmeso.data.sh_btf import basis_everywhere, held_basis
+from torchmeso.data.sh_btf import basis_against, basis_everywhere, held_basis
 from torchmeso.errors import FormatError, ShapeError, check_finite, check_shape
 from torchmeso.geometry import hemisphere, triangulation
 from torchmeso.geometry.hemisphere import DirectionSet
@@ -134,6 +134,16 @@ class ShPcaBtf:
         """
         each = torch.einsum("kmc,m->kc", self.basis.to(uv.dtype), self.everywhere.to(uv.dtype))
         return self.weights(uv, wo, seen, most=1) @ each
+
+    def over_light(
+        self, uv: Float[Tensor, "n 2"], wo: Float[Tensor, "n 3"], seen: Footprint | None = None
+    ) -> Float[Tensor, "n k_l 3"]:
+        """Return c_rho(uv, wo), T's coefficients over the light; `against` says what they are worth in a light."""
+        return torch.einsum("nk,kmc->nmc", self.weights(uv, wo, seen), self.basis.to(uv.dtype))
+
+    def against(self, degree: int) -> Float[Tensor, "k_l n"]:
+        """Return A: what T's coefficients reflect, times pi, of each harmonic of distant light; see `basis_against`."""
+        return basis_against(self.lights, self.terms, degree)
 
     def weights(
         self,

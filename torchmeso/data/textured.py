@@ -57,13 +57,17 @@ class Textured:
         """
         cosine = dot(self.normal(uv, seen), wi).clamp(min=0)
         lit = torch.where(wi[..., 2] > 0, cosine, 0).unsqueeze(-1)
-        return _look_up(self.albedo_levels, uv, seen, self.quilting) * lit
+        return self.colour(uv, seen) * lit
 
     def ambient(
         self, uv: Float[Tensor, "*batch 2"], wo: Float[Tensor, "*batch 3"], seen: Footprint | None = None
     ) -> Float[Tensor, "*batch 3"]:
         """Return L_a(uv, wo) = (1/pi) times the integral of T over the light hemisphere (white: 1)."""
-        return _look_up(self.albedo_levels, uv, seen, self.quilting) * (0.5 * (1 + self.normal(uv, seen)[..., 2:]))
+        return self.colour(uv, seen) * (0.5 * (1 + self.normal(uv, seen)[..., 2:]))
+
+    def colour(self, uv: Float[Tensor, "*batch 2"], seen: Footprint | None = None) -> Float[Tensor, "*batch 3"]:
+        """Return the albedo at uv."""
+        return _look_up(self.albedo_levels, uv, seen, self.quilting)
 
     def normal(self, uv: Float[Tensor, "*batch 2"], seen: Footprint | None = None) -> Float[Tensor, "*batch 3"]:
         """Return the unit normal n(uv) in the local frame."""

@@ -1,4 +1,4 @@
-"""Many frames of a configuration: around the subject, or with the lights going around it.
+"""Many frames of a configuration: around the subject, or with the lights or the environment going around it.
 
 Test: tests/pipeline/test_animate.py
 """
@@ -11,14 +11,15 @@ import torch
 
 from torchmeso.config_sections import Config, Vector
 from torchmeso.data import store, video
-from torchmeso.errors import check_range
+from torchmeso.errors import ConfigError, check_range
 from torchmeso.geometry.camera import Camera
 from torchmeso.geometry.light import Light
+from torchmeso.pipeline import environment
 from torchmeso.pipeline import scene as scenes
 from torchmeso.pipeline.bake import CODE, Report, code_hash, file_hash, prepare, silent
 from torchmeso.pipeline.render import Painter
 
-Way = Literal["turntable", "light"]
+Way = Literal["turntable", "light", "environment"]
 
 
 def render(
@@ -37,12 +38,19 @@ def render(
     """
     check_range("frames", frames, 1, 100_000)
     check_range("fps", fps, 1, 1000)
-    painter = Painter(scenes.build(config, prepare(config, report)), config.render, config.backend)
+    if way == "environment" and config.environment is None:
+        raise ConfigError("frames: expected an environment to turn, got none; name one with --env F, or --env sky")
+    lit = environment.prepare(config, scenes.build(config, prepare(config, report)), report)
+    painter = Painter(lit(0.0), config.render, config.backend)
     with video.record(out, fps=fps, count=frames, job=_job(config, way)) as reel:
         for i, (camera, lights) in enumerate(turn(config, frames, way)):
             report("frames", i / frames)
-            if not reel.skip():
-                reel.add(painter.show(camera, lights))
+            if reel.skip():
+                continue
+            if way == "environment":
+                painter.change(lit(360.0 * i / frames))
+            own = config.environment is not None or way == "environment"
+            reel.add(painter.show(camera, None if own else lights))
     report("frames", 1)
     return video.paths(out, frames)
 
@@ -54,7 +62,7 @@ def turn(config: Config, frames: int, way: Way) -> Iterator[tuple[Camera, tuple[
         view, lights = config.camera, config.lights
         if way == "turntable":
             view = view.model_copy(update={"eye": _around(view.eye, view.at, view.up, angle)})
-        else:
+        elif way == "light":
             # Directions turn around the origin, places around what the camera looks at.
             lights = [
                 light.model_copy(
@@ -73,7 +81,8 @@ def turn(config: Config, frames: int, way: Way) -> Iterator[tuple[Camera, tuple[
 
 def _job(config: Config, way: Way) -> str:
     """Return a hash of all that decides what the frames show."""
-    files = [o.mesh for o in config.objects] + [m.model for m in config.materials.values()]
+    files = [] if config.environment is None else [config.environment.map]
+    files += [o.mesh for o in config.objects] + [m.model for m in config.materials.values()]
     for material in config.materials.values():
         files += material.meso.files if material.meso else []
     return store.content_hash(repr(config), way, [file_hash(f) for f in files if f], code_hash((*CODE, "render")))

@@ -15,6 +15,7 @@ from torchmeso.data import image
 from torchmeso.errors import BackendError
 from torchmeso.geometry.camera import Camera
 from torchmeso.geometry.light import Light
+from torchmeso.pipeline import environment
 from torchmeso.pipeline import scene as scenes
 from torchmeso.pipeline.bake import Asset, Report, prepare, silent
 from torchmeso.render import frame
@@ -59,6 +60,12 @@ class Painter:
                 raise
             warnings.warn(f"{error}; rendering on torch", stacklevel=2)
 
+    def change(self, scene: Scene) -> None:
+        """Paint `scene` from now on; what is the same as before stays ready."""
+        self._scene = scene
+        if self._renderer is not None:
+            self._renderer.update(scene)
+
     def paint(self, camera: Camera, lights: tuple[Light, ...] | None = None) -> Picture:
         """Return the picture seen by `camera`; the next one may be written into the same memory."""
         if self._renderer is not None:
@@ -81,7 +88,7 @@ def render(config: Config, report: Report = silent) -> Rendering:
     """
     camera = config.camera.build()
     assets = prepare(config, report)
-    scene = scenes.build(config, assets)
+    scene = environment.prepare(config, scenes.build(config, assets), report)(0.0)
     report("render", 0)
     picture = Painter(scene, config.render, config.backend).paint(camera)
     report("render", 1)

@@ -1,7 +1,8 @@
 """The ray-traced truth of a configuration: every mesostructure laid over its mesh as triangles, path-traced.
 
 It shares with the product only the ray caster, `transport` and the prism mapping. One path bundle goes
-through each pixel's centre, because that is what the product samples; the ambient term is a uniform sky.
+through each pixel's centre, because that is what the product samples; the ambient term is a uniform sky. An
+environment shines as so many directional lights as its configuration says.
 
 Test: tests/pipeline/test_truth.py
 """
@@ -27,6 +28,7 @@ from torchmeso.meso.displace import displace
 from torchmeso.meso.mesostructure import Mesostructure, palette
 from torchmeso.pipeline.bake import Report, code_hash, describe_meso, file_hash, silent
 from torchmeso.pipeline.scene import Body, read_bodies, read_body
+from torchmeso.transport import light_sampling
 from torchmeso.transport.path import radiance
 from torchmeso.transport.tracer import Geometry, MeshTracer
 
@@ -68,6 +70,8 @@ def render(config: Config, report: Report = silent) -> Truth:
     tracer = MeshTracer(*parts)
     report("truth: displaced mesh", 1)
     camera, lights = config.camera.build(), [light.build() for light in config.lights]
+    if config.environment is not None:
+        lights += light_sampling.lights(config.environment.build(), config.environment.lights)
     found = _trace(config, tracer, camera, lights, report)
     found = replace(found, owner=torch.tensor([*objects, -1])[found.owner])
     store.write_model(path, {"rgb": found.rgb, "depth": found.depth, "owner": found.owner}, {"kind": "truth"})
@@ -197,7 +201,9 @@ def _trace(config: Config, tracer: MeshTracer, camera: Camera, lights: list[Ligh
 def _key(config: Config) -> str:
     used = {name: config.materials[name] for o in config.objects for name in o.used_materials}
     meshes = [[file_hash(o.mesh), _own_looks(o)] if o.mesh else None for o in config.objects]
-    about = config.model_dump(include={"objects", "lights", "ambient", "background", "camera", "truth"})
+    about = config.model_dump(include={"objects", "lights", "environment", "ambient", "background", "camera", "truth"})
+    if config.environment is not None and config.environment.map is not None:
+        meshes.append([file_hash(config.environment.map)])
     return store.content_hash(about, meshes, {n: _describe(m) for n, m in used.items()}, code_hash(CODE))
 
 

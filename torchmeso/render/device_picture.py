@@ -26,7 +26,12 @@ FRAME = np.dtype(
     [(name, "i4") for name in ("lights", "ambient_paper", "depths", "outputs")]
     + [(name, "i4") for name in ("capacity", "skips", "stride", "pitch")]
     + [("ambient", "f4"), ("background", "f4", 3), ("rank_error", "f4"), ("pixel", "f4")]
-    + [("starts", "i4"), ("pad", "i4"), ("start_tet", "i4", MOST_STARTS), ("start_surface", "i4", MOST_STARTS)]
+    + [
+        ("starts", "i4"),
+        ("distant_degree", "i4"),
+        ("start_tet", "i4", MOST_STARTS),
+        ("start_surface", "i4", MOST_STARTS),
+    ]
     + [("start_place", "f4", (MOST_STARTS, 4))]
 )
 

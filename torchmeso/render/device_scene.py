@@ -10,7 +10,7 @@ from typing import NamedTuple
 from torchmeso.backends import opencl
 from torchmeso.geometry import shell
 from torchmeso.geometry.camera import Camera
-from torchmeso.render import device, device_gdm, device_shell, device_tables
+from torchmeso.render import device, device_environment, device_gdm, device_shell, device_tables, environment
 from torchmeso.render.casters import Corners, corners_of
 from torchmeso.render.frame import FrameOptions, Skips
 from torchmeso.render.scene import Material, Scene, World, assemble
@@ -27,6 +27,7 @@ class SceneOnDevice(NamedTuple):
     object_of: list[int]  # of each surface
     shells: device_shell.DeviceShells | None
     gdms: device_gdm.DeviceGdms | None
+    distant: device_environment.DeviceDistant | None
 
     def starts(self, camera: Camera) -> Iterator[tuple[int, int, list[float]]]:
         """Yield the tetrahedra that the eye is in, their surfaces, and its texture coordinates there."""
@@ -40,6 +41,11 @@ class SceneOnDevice(NamedTuple):
         if self.shells is None or self.gdms is None:
             return ()
         return (*self.shells, self.gdms.tables, self.gdms.gdms)
+
+    @property
+    def of_distant(self) -> "tuple[opencl.Buffer, ...]":
+        """What kernels are given of distant light."""
+        return () if self.distant is None else self.distant.arguments
 
     @property
     def mixed(self) -> bool:
@@ -58,6 +64,7 @@ def upload_scene(scene: Scene, options: FrameOptions, before: SceneOnDevice | No
     Raises:
         BackendError: a material is of a kind that kernels do not read.
     """
+    environment.check(scene)
     materials = device_tables.upload_materials(
         scene.surfaces,
         silhouettes=options.silhouette != "none",
@@ -70,15 +77,17 @@ def upload_scene(scene: Scene, options: FrameOptions, before: SceneOnDevice | No
     object_of = [i for i, o in enumerate(scene.objects) for _ in o.materials]
     same = before is not None and are(_meshes(scene), _meshes(before.scene)) and object_of == before.object_of
     if before is not None and same:
-        return before._replace(scene=scene, materials=materials, gdms=gdms)
+        distant = device_environment.upload_distant(scene, before.world, before.distant)
+        return before._replace(scene=scene, materials=materials, gdms=gdms, distant=distant)
     world = assemble(scene)
     corners = corners_of(world)
     shells = None
     if world.shells:
         shells = device_shell.upload_shells([(s.shell, s.mesh, s.first_vertex) for s in world.shells])
     return SceneOnDevice(
-        scene, world, device.upload_geometry(world), materials, corners, object_of, shells, gdms if shells else None
-    )
+        scene, world, device.upload_geometry(world), materials, corners, object_of, shells, gdms if shells else None,
+        device_environment.upload_distant(scene, world, None if before is None else before.distant),
+    )  # fmt: skip
 
 
 def _dressing(material: Material, skips: Skips) -> device_gdm.Dressing | None:

@@ -32,6 +32,9 @@ from torchmeso.render.scene import Material
 BLOCK, GROUP, MOST_TERMS = 64, 4, 64
 """Bytes that tables are aligned to, components that stand in one vector, and the most harmonics of light or view."""
 
+MOST_DISTANT = 7
+"""Degree of distant light that kernels read."""
+
 PCA_GROUP = 8
 """Components of an SH + PCA BTF that stand in one vector."""
 
@@ -173,7 +176,7 @@ def _join(
         blocks += part.blocks
     arrays = []
     for key, source in new.items():
-        pool = _Pool()
+        pool = Pool()
         if isinstance(source, EigenBtf):
             record = _reflectance(pool, source, ambient=key[1])
         elif isinstance(source, ShBtf):
@@ -182,7 +185,7 @@ def _join(
             record = _harmonic_components(pool, source)
         else:
             record = _pictures(pool, source) if isinstance(source, Textured) else _mdf(pool, source)
-        record["quilt"] = -1 if source.quilting is None else _quilt(pool, source.quilting)
+        record["quilt"] = -1 if source.quilting is None else add_quilt(pool, source.quilting)
         arrays.append(pool.joined())
         parts[key] = _Part(source, blocks, len(arrays[-1]) // BLOCK, record)
         blocks += parts[key].blocks
@@ -228,7 +231,7 @@ def _readable_mdf(mdf: object) -> Mdf:
     return mdf
 
 
-def _reflectance(pool: "_Pool", btf: EigenBtf, *, ambient: bool) -> np.ndarray:
+def _reflectance(pool: "Pool", btf: EigenBtf, *, ambient: bool) -> np.ndarray:
     record = np.zeros(1, REFLECTANCE)
     groups = -(-btf.rank // GROUP)
     codes = btf.maps.dtype == torch.uint8
@@ -236,25 +239,25 @@ def _reflectance(pool: "_Pool", btf: EigenBtf, *, ambient: bool) -> np.ndarray:
     maps = [hemisphere.with_pole(x if codes else x.float(), btf.lights).flatten(0, 2) for x in btf.levels]
     views, fine = btf.fine_weights
     weights = hemisphere.with_pole(fine.float(), views)
-    scale, offset = _grouped(btf.scale.float()[None])[0], _grouped(btf.offset.float()[None])[0]
-    by_channel = _grouped(weights[:, :, None].expand(-1, -1, 3))
+    scale, offset = in_groups(btf.scale.float()[None])[0], in_groups(btf.offset.float()[None])[0]
+    by_channel = in_groups(weights[:, :, None].expand(-1, -1, 3))
     by_channel[:, :, 3] = _bounds(btf, weights)
     record["there"], record["height"], record["width"], record["groups"] = EIGEN, height, width, groups
     record["codes"] = codes
-    record["light_rings"], record["light_count"] = pool.add(ring_records(btf.lights)), _ring_count(btf.lights)
-    record["view_rings"], record["view_count"] = pool.add(ring_records(views)), _ring_count(views)
-    record["maps"] = pool.add(_grouped(torch.cat(maps)).numpy())
+    record["light_rings"], record["light_count"] = pool.add(ring_records(btf.lights)), ring_count(btf.lights)
+    record["view_rings"], record["view_count"] = pool.add(ring_records(views)), ring_count(views)
+    record["maps"] = pool.add(in_groups(torch.cat(maps)).numpy())
     record["levels"], record["level_count"] = pool.add(_level_records(btf, [len(x) for x in maps])), len(maps)
     record["weights"], record["scale"], record["offset"] = (pool.add(x.numpy()) for x in (by_channel, scale, offset))
     if ambient:
         values, unit, zero = _as_codes(torch.cat([x.flatten(0, 1) for x in btf.ambient_maps]).float(), codes=codes)
-        record["ambient"] = pool.add(_grouped(values).numpy())
-        record["ambient_scale"], record["ambient_offset"] = (pool.add(_grouped(x).numpy()) for x in (unit, zero))
+        record["ambient"] = pool.add(in_groups(values).numpy())
+        record["ambient_scale"], record["ambient_offset"] = (pool.add(in_groups(x).numpy()) for x in (unit, zero))
     record["last_cosine"] = math.cos(btf.lights.last)
     return record
 
 
-def _harmonics(pool: "_Pool", btf: ShBtf) -> np.ndarray:
+def _harmonics(pool: "Pool", btf: ShBtf) -> np.ndarray:
     record = np.zeros(1, REFLECTANCE)
     k_l, k_v = btf.terms
     groups = -(-k_v // GROUP)
@@ -280,10 +283,11 @@ def _harmonics(pool: "_Pool", btf: ShBtf) -> np.ndarray:
         record[f"{side}_steps"] = pool.add(spherical_harmonics.recurrence(degree))
         record[f"{side}_degree"] = degree
     record["last_cosine"], record["view_last_cosine"] = math.cos(btf.lights.last), math.cos(btf.views.last)
+    record["light_rings"] = pool.add(by_order(btf.against(MOST_DISTANT)))
     return record
 
 
-def _harmonic_components(pool: "_Pool", btf: ShPcaBtf) -> np.ndarray:
+def _harmonic_components(pool: "Pool", btf: ShPcaBtf) -> np.ndarray:
     record = np.zeros(1, REFLECTANCE)
     codes = btf.maps.dtype == torch.uint8
     more = -btf.rank % PCA_GROUP
@@ -311,7 +315,18 @@ def _harmonic_components(pool: "_Pool", btf: ShPcaBtf) -> np.ndarray:
     degree = spherical_harmonics.degree_of(btf.terms)
     record["light_steps"], record["light_degree"] = pool.add(spherical_harmonics.recurrence(degree)), degree
     record["last_cosine"] = math.cos(btf.lights.last)
+    record["light_rings"] = pool.add(by_order(btf.against(MOST_DISTANT)))
     return record
+
+
+def by_order(A: Float[Tensor, "k_l n"]) -> Float32[np.ndarray, "k_l degree"]:
+    """Return a matrix of harmonics over harmonics as kernels read it: of each row what has its own m, by degree."""
+    degree = spherical_harmonics.degree_of(A.shape[1])
+    rows = np.zeros((len(A), degree + 1), np.float32)
+    for l in range(spherical_harmonics.degree_of(len(A)) + 1):
+        for m in range(-l, l + 1):
+            rows[l * l + l + m, abs(m) :] = [float(A[l * l + l + m, k * k + k + m]) for k in range(abs(m), degree + 1)]
+    return rows
 
 
 def _triangles(directions: DirectionSet) -> tuple[Float32[np.ndarray, "strip 4"], Float32[np.ndarray, "edge 4"]]:
@@ -343,7 +358,7 @@ def _level_records(btf: EigenBtf, rows: list[int]) -> Int32[np.ndarray, "level 4
     return np.stack([first, ambient, *np.array(sizes).T], 1).astype(np.int32)
 
 
-def _pictures(pool: "_Pool", looks: Textured) -> np.ndarray:
+def _pictures(pool: "Pool", looks: Textured) -> np.ndarray:
     record = np.zeros(1, REFLECTANCE)
     record["there"], record["normals"] = TEXTURED, -1
     record["maps"], record["levels"], record["level_count"] = _levels_of_four(pool, looks.albedo_levels)
@@ -353,7 +368,7 @@ def _pictures(pool: "_Pool", looks: Textured) -> np.ndarray:
     return record
 
 
-def _quilt(pool: "_Pool", quilting: QuiltingMap) -> int:
+def add_quilt(pool: "Pool", quilting: QuiltingMap) -> int:
     """Return where a quilting map begins: its sizes on a block of their own, then row << 16 | column of each texel."""
     record = np.zeros(1, QUILT)
     (record["height"], record["width"]), (record["source_height"], record["source_width"]) = (
@@ -367,7 +382,7 @@ def _quilt(pool: "_Pool", quilting: QuiltingMap) -> int:
     return first
 
 
-def _levels_of_four(pool: "_Pool", levels: list[Float[Tensor, "_ _ 3"]]) -> tuple[int, int, int]:
+def _levels_of_four(pool: "Pool", levels: list[Float[Tensor, "_ _ 3"]]) -> tuple[int, int, int]:
     """Return where a pyramid's pictures begin, one behind the other, and where their sizes stand; and their number."""
     sizes = [tuple(x.shape[:2]) for x in levels]
     first = np.cumsum([0, *(h * w for h, w in sizes[:-1])])
@@ -387,7 +402,7 @@ def _bounds(btf: EigenBtf, weights: Float[Tensor, "view rank"]) -> Float[Tensor,
     return padded.reshape(len(each), -1, GROUP).sum(-1)
 
 
-def _grouped(x: Tensor) -> Tensor:
+def in_groups(x: Tensor) -> Tensor:
     """Return (..., rank, 3) as (..., group, 16): four components of rgb and nothing in a vector."""
     *batch, rank, _ = x.shape
     groups = -(-rank // GROUP)
@@ -396,13 +411,13 @@ def _grouped(x: Tensor) -> Tensor:
     return padded.reshape(*batch, groups, 16)
 
 
-def _mdf(pool: "_Pool", mdf: Mdf) -> np.ndarray:
+def _mdf(pool: "Pool", mdf: Mdf) -> np.ndarray:
     record = np.zeros(1, MDF)
     delta = hemisphere.with_pole(mdf.delta, mdf.directions)
     paired = torch.stack([delta, delta[_next_in_ring(mdf.directions)]], -1)
     relief = mdf.relief
     record["there"], record["height"], record["width"] = 1, *mdf.texels
-    record["rings"], record["ring_count"] = pool.add(ring_records(mdf.directions)), _ring_count(mdf.directions)
+    record["rings"], record["ring_count"] = pool.add(ring_records(mdf.directions)), ring_count(mdf.directions)
     record["delta"] = pool.add(paired.numpy())
     missing = None if mdf.no_hit is None else hemisphere.with_pole(mdf.no_hit.float(), mdf.directions)
     record["missing"] = -1 if missing is None else pool.add(missing.numpy())
@@ -444,11 +459,12 @@ def _next_in_ring(directions: DirectionSet) -> Int[Tensor, "node"]:
     return following
 
 
-def _ring_count(directions: DirectionSet) -> int:
+def ring_count(directions: DirectionSet) -> int:
+    """Return the number of rings, a pole that a table needs among them."""
     return len(hemisphere.rings(directions).theta)
 
 
-class _Pool:
+class Pool:
     """Arrays one behind the other, each on a block of its own."""
 
     def __init__(self) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
@@ -61,6 +62,24 @@ def average(paint: Callable[[Camera], Picture], cameras: Iterable[Camera]) -> Pi
     if first is None or total is None:
         raise ConfigError("average: expected at least one camera, got none")
     return replace(first, rgb=(total / count).to(first.rgb.dtype), seconds=seconds)
+
+
+def total(pictures: Iterable[Picture]) -> Picture:
+    """Return one view under the lights of several pictures: colours of what is seen and times summed up."""
+    first, rgb, shadowed = None, None, []
+    seconds: dict[str, float] = {}
+    for picture in pictures:
+        if first is None or rgb is None:
+            first = replace(picture, depth=picture.depth.clone(), owner=picture.owner.clone())
+            rgb = picture.rgb.double()
+        else:
+            rgb += picture.rgb * (first.owner >= 0)[..., None]
+        shadowed.append(picture.shadowed)
+        for stage, time in picture.seconds.items():
+            seconds[stage] = seconds.get(stage, 0.0) + time
+    if first is None or rgb is None:
+        raise ConfigError("total: expected at least one picture, got none")
+    return replace(first, rgb=rgb.to(first.rgb.dtype), shadowed=torch.cat(shadowed), seconds=seconds)
 
 
 def write(picture: Picture, path: str | Path) -> None:

@@ -14,14 +14,15 @@ import torch
 from torch import Tensor
 
 from torchmeso.errors import check_memory, check_range
+from torchmeso.geometry import frames
 from torchmeso.geometry.camera import Camera
 from torchmeso.geometry.directions import dot
 from torchmeso.geometry.light import illuminate
-from torchmeso.render import film, gdm_shade, shadow_map
+from torchmeso.render import environment, film, gdm_shade, shadow_map
 from torchmeso.render.btf_shade import shade
 from torchmeso.render.film import Picture
 from torchmeso.render.rasterize import Layers, rasterize
-from torchmeso.render.scene import Points, Scene, World, assemble, interpolate, rays
+from torchmeso.render.scene import Points, Scene, World, arriving_at, assemble, interpolate, rays
 from torchmeso.render.silhouette import Candidates, Counts, Silhouette, find_candidates, nearest
 
 MEMORY_LIMIT = 16 << 30
@@ -110,6 +111,7 @@ def render(scene: Scene, camera: Camera, options: FrameOptions | None = None) ->
 def _render(scene: Scene, camera: Camera, options: FrameOptions) -> Picture:
     check_memory("render", camera.width * camera.height * 600.0, MEMORY_LIMIT, "render fewer pixels")
     seconds: dict[str, float] = {}
+    environment.check(scene)
     with _timed(seconds, "assemble"):
         world = assemble(scene)
         camera, scene = world.seen_by(camera), replace(scene, lights=world.lit_by(scene.lights))
@@ -161,6 +163,10 @@ def _develop(
     shadowed[:, plain.pixel] = dark
     samples = options.antialias if options.filtering else None
     rgb[plain.pixel] = shade(scene, points, -direction, dark, samples=samples)
+    if scene.distant is not None:
+        arriving = arriving_at(scene.distant, world, layers, camera, plain.fragment)
+        wo = frames.to_local(points.frame, -direction)
+        rgb[plain.pixel] += environment.shade(scene, points, wo, arriving, samples=samples)
 
     if len(met.pixel):
         origin, direction, _ = rays(camera, met.pixel, dtype)

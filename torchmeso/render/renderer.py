@@ -96,6 +96,9 @@ class Renderer:
             ("-DQUILTED", self._on_device.materials.quilted),
             ("-DGDM", self._on_device.shells is not None),
         )
+        distant = self._on_device.distant
+        self._distant = ("-DDISTANT",) if distant else ()
+        self._distant += ("-DTRANSFER",) if distant and distant.field else ()
         self._defines = (f"-DSILHOUETTE={mode}", *(name for name, needed in wanted if needed))
         self._plain = mode == 0 and self.options.silhouette != "none"
         self._cull = mode == 0 and self._skips.hidden  # where no surface has depth, faces turned away hide nothing
@@ -112,15 +115,28 @@ class Renderer:
 
         Raises:
             SizeError: the picture would need more memory than the limit.
-            BackendError: too many lights.
+            BackendError: too many lights for ambient light that shows only in shadow.
         """
         if self.options.antialias > 1:
             return film.average(lambda c: self._render(c, lights), camera.jittered(self.options.antialias))
         return self._render(camera, lights)
 
     def _render(self, camera: Camera, lights: tuple[Light, ...] | None) -> Picture:
+        given = self._on_device.scene.lights if lights is None else lights
+        if len(given) <= MAX_LIGHTS:
+            return self._pass(camera, lights)
+        if self._on_device.scene.ambient_rule == "paper":
+            raise BackendError(
+                f"opencl: expected at most {MAX_LIGHTS} lights where ambient light shows only in shadow, "
+                f"got {len(given)}; use the torch backend"
+            )
+        parts = [given[i : i + MAX_LIGHTS] for i in range(0, len(given), MAX_LIGHTS)]
+        return film.total(self._pass(camera, part, further=i > 0) for i, part in enumerate(parts))
+
+    def _pass(self, camera: Camera, lights: tuple[Light, ...] | None, *, further: bool = False) -> Picture:
+        """Return the picture under lights that one kernel can hold; `further` ones leave out what is no light's."""
         start = time.perf_counter()
-        picture = self._frame(camera, lights, DETAILS)
+        picture = self._frame(camera, lights, DETAILS, further=further)
         seconds = {"frame": time.perf_counter() - start, **self._seconds}
         self._seconds = {}
         return picture.finished(camera, self._on_device.object_of, self.counts, seconds)
@@ -130,23 +146,22 @@ class Renderer:
 
         Arguments, memory and errors as for `render`.
         """
-        if self.options.antialias > 1:
+        many = len(self._on_device.scene.lights if lights is None else lights) > MAX_LIGHTS
+        if self.options.antialias > 1 or many:
             picture = self.render(camera, lights)
             seen = 255 * (picture.owner != -1).to(torch.uint8)
             return torch.cat([torch.from_numpy(image.to_bytes(picture.rgb)), seen[..., None]], -1)
         picture = self._frame(camera, lights, DISPLAY)
         return picture.shown[: camera.height, : camera.width]
 
-    def _frame(self, camera: Camera, lights: tuple[Light, ...] | None, outputs: int) -> DevicePicture:
+    def _frame(
+        self, camera: Camera, lights: tuple[Light, ...] | None, outputs: int, *, further: bool = False
+    ) -> DevicePicture:
         world = self._on_device.world
         given = lights = world.lit_by(self._on_device.scene.lights if lights is None else lights)
         camera = world.seen_by(camera)
         reaching = [i for i, light in enumerate(lights) if not self._skips.unlit or self._reaches(light)]
         lights = tuple(lights[i] for i in reaching) if len(reaching) < len(lights) else lights
-        if len(lights) > MAX_LIGHTS:
-            raise BackendError(
-                f"opencl: expected at most {MAX_LIGHTS} lights, got {len(lights)}; use the torch backend"
-            )
         check_memory("render", camera.width * camera.height * 100.0, MEMORY_LIMIT, "render fewer pixels")
         while True:
             maps, picture = self._room(camera, lights)
@@ -160,7 +175,7 @@ class Renderer:
                 rest=self._skips.resting,
             )
             drawn = maps is not None and self._draw_maps(maps, lights)
-            self._draw_picture(picture, camera, lights, outputs)
+            self._draw_picture(picture, camera, lights, outputs, further)
             counts = picture.views.counts()
             if self._fits(counts + (maps.views.counts() if drawn and maps else [])):
                 break
@@ -293,7 +308,9 @@ class Renderer:
             for number in range(views.count)
         ]  # fmt: skip
 
-    def _draw_picture(self, picture: DevicePicture, camera: Camera, lights: tuple[Light, ...], outputs: int) -> None:
+    def _draw_picture(
+        self, picture: DevicePicture, camera: Camera, lights: tuple[Light, ...], outputs: int, further: bool
+    ) -> None:
         """Draw the picture of the camera it is aimed with."""
         scene, maps = self._on_device.scene, self._maps
         if picture.shone is not lights:
@@ -311,8 +328,9 @@ class Renderer:
         frame["skips"], frame["rank_error"] = self._skip_bits(), self.options.rank_error
         frame["pixel"] = camera.pixel_size / self.options.antialias
         frame["pitch"] = picture.rgba.shape[1]
-        frame["ambient"], frame["background"] = scene.ambient, scene.background
+        frame["ambient"], frame["background"] = 0.0 if further else scene.ambient, scene.background
         frame["starts"] = 0
+        frame["distant_degree"] = self._on_device.distant.degree if self._on_device.distant and not further else -1
         for k, start in enumerate(itertools.islice(self._on_device.starts(camera), MOST_STARTS)):
             frame["start_tet"][k], frame["start_surface"][k], frame["start_place"][k, :3] = start
             frame["starts"] = k + 1
@@ -340,8 +358,10 @@ class Renderer:
              geometry.records, geometry.facets, materials.tables, materials.mdfs, materials.reflectances,
              picture.lights.buffer, lights.views, lights.slots, lights.labels, lights.counters, *stored,
              picture.frame.buffer, *self._layers(),
-             *(b for b, _ in picture.results), picture.empty.buffer, *self._on_device.of_shells),
-            (*self._defines, *(["-DSHADOWS"] * self.options.shadows), *(["-DFILTERED"] * self.options.filtering)),
+             *(b for b, _ in picture.results), picture.empty.buffer, *self._on_device.of_shells,
+             *self._on_device.of_distant),
+            (*self._defines, *self._distant, *(["-DSHADOWS"] * self.options.shadows),
+             *(["-DFILTERED"] * self.options.filtering)),
         )  # fmt: skip
 
 

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchmeso.data.btf import Evaluable
+from torchmeso.data.distant_light import DistantLight
 from torchmeso.data.gdm import Gdm
 from torchmeso.data.quilting_map import QuiltingMap
 from torchmeso.errors import ConfigError, check_range, check_shape
@@ -161,6 +162,8 @@ class Scene:
         ambient_rule: "add" adds ambient L_a to every pixel; "paper" shows it only where no light arrives
             (wang2005mdf, section 4.2).
         background: linear RGB where nothing is seen.
+        distant: light from all around in spherical harmonics, or None; it falls through bodies, unless it was followed
+            to their vertices.
     """
 
     objects: tuple[Object, ...]
@@ -168,6 +171,7 @@ class Scene:
     ambient: float = 0.05
     ambient_rule: str = "add"
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    distant: DistantLight | None = None
 
     def __post_init__(self) -> None:
         """Raise ConfigError for a scene no picture can be made of."""
@@ -401,6 +405,18 @@ def interpolate(world: World, layers: Layers, camera: Camera, which: Int[Tensor,
     frame = frames.orthonormal(mean(world.normals), mean(world.tangents), world.sign[corner[:, 0]])
     scale = mean(world.scale[:, None])[:, 0]
     return Points(position, mean(world.uv), frame, scale, world.owner[face], camera.pixel_width(position))
+
+
+def arriving_at(
+    light: DistantLight, world: World, layers: Layers, camera: Camera, which: Int[Tensor, "n"]
+) -> Float[Tensor, "n n_e 3"]:
+    """Return the coefficients of distant light at the fragments `which`, world."""
+    if light.at_vertices is None:
+        return light.coefficients.expand(len(which), -1, -1)
+    weight = barycentric(layers, camera, which)
+    corner = world.faces[layers.triangles.face[layers.triangle[which]]]
+    at = light.at(len(world.vertices)).to(weight.dtype)
+    return (at[corner] * weight[..., None, None]).sum(1)
 
 
 def rays(

@@ -108,8 +108,9 @@ def blocked(
     """
     result = torch.zeros(len(position), dtype=torch.bool)
     deep = torch.zeros_like(result)
-    if above is not None:
-        way, enters, slope = (position - above.position).norm(dim=-1), above.lean > 0, _slope(above.lean)
+    way = torch.zeros(len(position)) if above is None else (position - above.position).norm(dim=-1)
+    lean = torch.zeros(len(position)) if above is None else above.lean  # light does not enter at cosine 0
+    enters, slope = lean > 0, _slope(lean)
     for face in shadow.faces:
         camera = face.camera
         x_w, y_w, w, depth = camera.project(position).unbind(-1)
@@ -124,7 +125,7 @@ def blocked(
         t = (position[seen] - camera.eye.to(position.dtype)).norm(dim=-1) if perspective else depth[seen]
         start = depth_at(face.triangles, camera, triangle, xy[seen])
         texel = row[seen] * camera.width + column[seen]
-        if above is not None:
+        if bool(enters.any()):
             texels = torch.where(way[seen] > 0, 1, slope[seen]) * (t if perspective else 1.0)
             deep[seen] |= enters[seen] & (t > face.front[texel] + 2 * way[seen] + camera.pixel_size * texels)
         start = start + face.behind[texel]
