@@ -116,10 +116,11 @@ def _on(
 
 
 def _heights(size: int) -> Iterator[Case]:
-    for h in (1e-5, 1e-3, 10.0):
+    for h, bound in ((1e-5, BOUND), (1e-3, BOUND), (10.0, 2 * BOUND)):  # in 10 tiles a float32 tells 1e-6 apart
         yield _case(
-            f"height_{h:g}", f"a slab of {h:g} tiles", lambda h=h: _on(small_torus(), table("weave", h=h)), size
-        )
+            f"height_{h:g}", f"a slab of {h:g} tiles", lambda h=h: _on(small_torus(), table("weave", h=h)), size,
+            bound=bound,
+        )  # fmt: skip
     for side in ("inward", "outward"):
         # One tile around the tube: the slab of 0.5 tiles is deeper than the tube's radius of 1 / (2 pi) tiles.
         yield _case(
@@ -184,9 +185,11 @@ def _meshes(size: int) -> Iterator[Case]:
     kinds: tuple[tuple[shell.Side, Base], ...] = (("inward", "solid"), ("outward", "open"))
     for name, (what, *arrays) in extremes.raw_meshes().items():
         for side, base in kinds:
+            # A texture drawn out into a line makes a tile a million units wide: the eye is deep in the shell.
+            bound = 10 * BOUND if (name, side) == ("uv_almost_a_line", "inward") else BOUND
             yield _case(
                 f"mesh_{name}_{side}", f"{what}, {side}",
-                lambda a=arrays, s=side, b=base: _on(dressed(*a), side=s, base=b), size,
+                lambda a=arrays, s=side, b=base: _on(dressed(*a), side=s, base=b), size, bound=bound,
             )  # fmt: skip
 
 
