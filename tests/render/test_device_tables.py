@@ -28,7 +28,7 @@ def test_tables_stand_on_blocks_of_64_bytes():
 
 def test_components_stand_in_vectors_of_four():
     x = torch.arange(6 * 3, dtype=torch.float32).reshape(1, 6, 3)
-    grouped = device_tables._grouped(x)
+    grouped = device_tables.in_groups(x)
     assert grouped.shape == (1, 2, 16)
     torch.testing.assert_close(grouped.reshape(1, 8, 4)[:, :6, :3], x)
     assert grouped.reshape(1, 8, 4)[:, 6:].abs().sum() == 0
