@@ -80,7 +80,7 @@ def half_written(place) -> list[Path]:
 BAKE = ("bake", "--meso", "brick", "--out", "a.mdf.zarr", "--texels", 24)
 
 
-@pytest.mark.parametrize("signal", [2, 9])
+@pytest.mark.parametrize("signal", [2, pytest.param(9, marks=pytest.mark.slow)])
 def test_a_bake_that_was_stopped_or_killed_goes_on(signal, place):
     process = start(place, *BAKE)
     done = place / "a.mdf.zarr.part" / "done"
