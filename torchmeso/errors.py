@@ -42,6 +42,10 @@ class BackendError(MesoError, RuntimeError):
     """OpenCL is missing, a kernel did not build, or a backend cannot do what is asked."""
 
 
+class RigError(MesoError, RuntimeError):
+    """A rig does not answer, refuses a command, or stands where it should not."""
+
+
 def check_shape(name: str, x: Any, expected: Sequence[int]) -> None:
     """Raise ShapeError unless `x` has exactly the shape `expected` (-1 matches any size)."""
     fits = len(x.shape) == len(expected) and all(e in (-1, n) for n, e in zip(x.shape, expected, strict=True))
