@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from types import TracebackType
-from typing import Literal, TypeVar
+from typing import Literal
 
 import serial
 from serial.tools import list_ports
@@ -26,7 +26,8 @@ from torchmeso.errors import ConfigError, RigError, check_range
 LOW, HIGH = Pose(-360.0, 0.0, -60.0), Pose(360.0, 180.0, 60.0)
 """Soft limits unless others are given, degrees."""
 
-Result = TypeVar("Result")
+STUCK = 5.0
+"""Seconds after which a port that takes no bytes is given up."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -112,7 +113,7 @@ class Rig:
         """
         port = find_port(options.port)
         try:
-            line = serial.Serial(port, options.baud, timeout=0.01, write_timeout=options.answer)
+            line = serial.Serial(port, options.baud, timeout=0.01, write_timeout=STUCK)
         except (serial.SerialException, OSError, ValueError) as error:
             raise RigError(f"rig: {port} does not open ({error}); is it another program's?") from error
         rig = cls(options, line, dialects.dialect(options.dialect))
@@ -178,13 +179,7 @@ class Rig:
         Raises:
             RigError: the rig moves, or does not tell.
         """
-        last = None
-        for _ in range(4 * self.options.tries):
-            found = self._report()
-            if found and found.still and found.pose == last:
-                return found.pose  # type: ignore[return-value]
-            last = found.pose if found and found.still else None
-        raise RigError("rig: no two reports in a row agree on where it stands; does it move, is its cable sound?")
+        return self._agreed()[0]
 
     def confirm(self, pose: Pose) -> None:
         """Ask, right before an exposure, whether the rig stands at `pose` and its laser is as it was set.
@@ -192,12 +187,11 @@ class Rig:
         Raises:
             RigError: it does not.
         """
-        stands = self.pose()
+        stands, power = self._agreed()
         if max(abs(a - b) for a, b in zip(stands, pose, strict=True)) > self.options.within:
             raise RigError(f"rig: expected it at {_told(pose)}, it stands at {_told(stands)}; nothing was exposed")
-        found = self._report()
-        if found and found.laser is not None and abs(found.laser - self.power) > 0.005:
-            raise RigError(f"rig: expected the laser at {self.power:g}, it is at {found.laser:g}; nothing was exposed")
+        if power is not None and abs(power - self.power) > 0.005:
+            raise RigError(f"rig: expected the laser at {self.power:g}, it is at {power:g}; nothing was exposed")
 
     def lamp(self, number: int, on: bool) -> None:
         """Switch a lamp, counted from 0.
@@ -263,8 +257,19 @@ class Rig:
 
     def _sound(self) -> bool:
         """Return whether the laser is as it was set, where the controller tells."""
-        found = self._report()
-        return found is not None and (found.laser is None or abs(found.laser - self.power) < 0.005)
+        power = self._agreed()[1]
+        return power is None or abs(power - self.power) < 0.005
+
+    def _agreed(self) -> tuple[Pose, float | None]:
+        """Return where the axes stand and the laser's power: what two reports in a row agree on."""
+        last = None
+        for _ in range(4 * self.options.tries):
+            found = self._report()
+            told = (found.pose, found.laser) if found is not None and found.still and found.pose is not None else None
+            if told is not None and told == last:
+                return told  # type: ignore[return-value]
+            last = told
+        raise RigError("rig: no two reports in a row agree on where it stands; does it move, is its cable sound?")
 
     def _obeyed(self, lines: tuple[str, ...], seconds: float) -> bool:
         """Return whether each of `lines` was answered with ok; an alarm is unlocked for the next try."""
