@@ -229,7 +229,7 @@ class Firmware:
         ):
             return b"error:20\r\n"
         others = {letter: float(x) for letter, x in words if letter not in "GM" and letter not in AXES}
-        if set(others) - {"S", "P"}:
+        if set(others) - {"S", "P"} or ("P" in others and not set(told) & {"G4", "M64", "M65"}):
             return b"error:36\r\n"
         if "G0" in told and axes:
             if set(told) - {"G90", "G0"}:
