@@ -53,7 +53,8 @@ def test_axes_shake_where_they_stop(grbl):
 @pytest.mark.parametrize(
     ("line", "answer"),
     [("G90G0X361", b"ALARM:2"), ("G90G0X1X2", b"error:25"), ("G90G0X1Y", b"error:2"), ("M64P3", b"error:39"),
-     ("M64P18", b"error:39"), ("M6P10", b"error:20"), ("64P10", b"error:1"), ("G91X1", b"error:20"), ("M5P10", b"error:36"),
+     ("M64P18", b"error:39"), ("M6P10", b"error:20"), ("64P10", b"error:1"), ("G91X1", b"error:20"),
+     ("M5P10", b"error:36"),
      ("X5", b"error:20"), ("$5", b"error:3"), ("", b"ok")],
 )  # fmt: skip
 def test_what_grbl_refuses(grbl, line, answer):
