@@ -26,6 +26,9 @@ from torchmeso.errors import ConfigError, RigError, check_range
 LOW, HIGH = Pose(-360.0, 0.0, -60.0), Pose(360.0, 180.0, 60.0)
 """Soft limits unless others are given, degrees."""
 
+KEPT = 64
+"""Numbered lines that are kept to be said again."""
+
 STUCK = 5.0
 """Seconds after which a port that takes no bytes is given up."""
 
@@ -101,6 +104,7 @@ class Rig:
     line: serial.Serial
     speech: Dialect
     number: int = 0
+    said: dict[int, str] = field(default_factory=dict)
     came: bytearray = field(default_factory=bytearray)
     power: float = 0.0
 
@@ -187,11 +191,15 @@ class Rig:
         Raises:
             RigError: it does not.
         """
-        stands, power = self._agreed()
-        if max(abs(a - b) for a, b in zip(stands, pose, strict=True)) > self.options.within:
+        for _ in range(3):  # two reports in a row may be damaged alike
+            stands, power = self._agreed()
+            there = max(abs(a - b) for a, b in zip(stands, pose, strict=True)) <= self.options.within
+            lit = power is None or abs(power - self.power) < 0.005
+            if there and lit:
+                return
+        if not there:
             raise RigError(f"rig: expected it at {_told(pose)}, it stands at {_told(stands)}; nothing was exposed")
-        if power is not None and abs(power - self.power) > 0.005:
-            raise RigError(f"rig: expected the laser at {self.power:g}, it is at {power:g}; nothing was exposed")
+        raise RigError(f"rig: expected the laser at {self.power:g}, it is at {power:g}; nothing was exposed")
 
     def lamp(self, number: int, on: bool) -> None:
         """Switch a lamp, counted from 0.
@@ -309,23 +317,35 @@ class Rig:
         return self._await(lambda r: r.kind in ("ok", "error", "alarm"), seconds)
 
     def _numbered(self, line: str, seconds: float) -> Reply | None:
-        """Say a numbered line until it arrived once."""
+        """Say a numbered line until it arrived once.
+
+        An ok has no number, and may be a late one to an earlier line: then that line is asked for by its number when
+        the next one comes, and is said again.
+        """
         self.number += 1
-        for _ in range(self.options.tries):
+        self.said[self.number] = line
+        self.said.pop(self.number - KEPT, None)
+        at = self.number
+        for _ in range(2 * self.options.tries):
             self._drain()
-            self._write(b"\n" + dialects.number_line(self.number, line).encode() + b"\n")
+            self._write(b"\n" + dialects.number_line(at, self.said[at]).encode() + b"\n")
             answer = self._await(lambda r: r.kind in ("ok", "error", "resend", "report"), seconds)
             if answer is None:  # the line or its answer is lost: the controller will say which
                 continue
             if answer.kind == "report":  # its own ok must not be taken for that of the next line
                 self._await(lambda r: r.kind == "ok", 0.2)
             if answer.kind in ("ok", "report"):
-                return answer
+                if at == self.number:
+                    return answer
+                at += 1
+                continue
             again = self._await(lambda r: r.kind == "resend", 0.2) if answer.kind == "error" else answer
             if again is not None and again.number == self.number + 1:
                 return Reply(kind="ok", text="it had arrived before")
-            if again is not None and again.number != self.number:
-                self._write(b"\n" + dialects.number_line(self.number - 1, f"M110 N{self.number - 1}").encode() + b"\n")
+            if again is not None and again.number in self.said:
+                at = again.number
+            elif again is not None:
+                self._write(b"\n" + dialects.number_line(at - 1, f"M110 N{at - 1}").encode() + b"\n")
                 self._await(lambda r: r.kind == "ok", self.options.answer)
         return None
 
