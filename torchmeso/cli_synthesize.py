@@ -99,34 +99,70 @@ def synthesize(
 
 @click.command()
 @click.argument("tiles")
-@click.option("--plane", default="16x16", show_default=True, help="Tiles across x down.")
+@click.argument("mesh", required=False)
+@click.option("--plane", default="16x16", show_default=True, help="Tiles across x down, where there is no MESH.")
 @click.option(
     "--order",
     type=click.Choice(["hash", "scanlines"]),
     default="hash",
     show_default=True,
-    help="Colours by a hash of their place, which repeats without a seam, or tile by tile, which does not.",
+    help="Plane: colours by a hash of their place, which repeats without a seam, or tile by tile, which does not.",
 )
+@click.option("--exemplar", help="Plane: what to show; writes a picture (.png) in place of a map.")
+@click.option(
+    "--by",
+    type=click.Choice(["auto", "quads", "polycube", "cube", "quadriflow"]),
+    default="auto",
+    show_default=True,
+    help="Mesh: where quads come from: its own, its PolyCube map, a cube around it, QuadriFlow; auto = what it has.",
+)
+@click.option("--split", type=int, help="Mesh: tiles along a side of a quad, 1-64 [1; 8 along a side of the cube].")
+@click.option("--quads", type=int, default=400, show_default=True, help="Mesh: about how many QuadriFlow makes.")
+@click.option("--smooth", type=int, help="Mesh: smaller quads along a side of a tile, 1-32 [1; 8 of QuadriFlow's].")
 @click.option("--seed", type=int, default=0, show_default=True, help="Same seed, same tiling.")
-@click.option("--exemplar", help="What to show: writes a picture (.png) in place of a map.")
-@click.option("--out", required=True, help="The map of the tiled plane (.quilt), or with --exemplar a picture (.png).")
+@click.option("--debug-pictures", type=click.Path(), help="Mesh: folder for a picture of the quads and frame jumps.")
+@click.option("--out", required=True, help="The tiled plane (.quilt, with --exemplar .png), or surface (.surface).")
 @click.option("--force", is_flag=True, help="Replace an existing file.")
-def tile(tiles: str, plane: str, order: str, seed: int, exemplar: str | None, out: str, force: bool) -> None:
-    """Lay a set of TILES (.tiles) over the plane, and write it as a map that materials are laid out by."""
+@click.pass_context
+def tile(
+    context: click.Context,
+    tiles: str,
+    mesh: str | None,
+    plane: str,
+    order: str,
+    exemplar: str | None,
+    seed: int,
+    debug_pictures: str | None,
+    out: str,
+    force: bool,
+    **options: Any,
+) -> None:
+    """Lay TILES (.tiles) over the plane, or over the surface of a MESH that any set of their kind then dresses."""
     from pathlib import Path
 
     from torchmeso.errors import human_size
     from torchmeso.pipeline import tiles as job
 
+    others = MESH_ONLY if mesh is None else PLANE_ONLY
+    _refuse(context, others, "belongs to a MESH" if mesh is None else "belongs to a plane, not to a MESH")
     refuse_to_replace(out, force)
-    found = job.lay(tiles, _size(plane, "--plane"), out, hashed=order == "hash", seed=seed, exemplar=exemplar)
-    height, width = found.texels
-    click.echo(
-        f"{out}  {plane} tiles, {width} x {height} texels from {found.source[1]} x {found.source[0]}  "
-        f"{human_size(Path(out).stat().st_size)}"
-    )
+    if mesh is None:
+        found = job.lay(tiles, _size(plane, "--plane"), out, hashed=order == "hash", seed=seed, exemplar=exemplar)
+        height, width = found.texels
+        line = f"{plane} tiles, {width} x {height} texels from {found.source[1]} x {found.source[0]}"
+    else:
+        from torchmeso.pipeline import dress
+        from torchmeso.synthesize.parameterize import SurfaceOptions
+
+        with progress() as report:
+            wanted = SurfaceOptions(seed=seed, **options)
+            surface = dress.run(tiles, mesh, wanted, out, pictures=debug_pictures, report=report)
+        line = f"{len(surface.faces)} triangles in {len(surface.quads)} quads, {len(surface.jumps)} frame jumps"
+    click.echo(f"{out}  {line}  {human_size(Path(out).stat().st_size)}")
 
 
+PLANE_ONLY = ("plane", "order", "exemplar")
+MESH_ONLY = ("by", "split", "quads", "smooth", "debug_pictures")
 QUILTING_ONLY = ("overlap", "tolerance", "rule", "tileable", "verbatim")
 WANG_ONLY = ("kind", "colours", "band", "candidates", "refine")
 
@@ -138,11 +174,16 @@ def _own(context: click.Context, method: str, options: dict[str, Any]) -> dict[s
         ConfigError: one of the other's was given.
     """
     others = QUILTING_ONLY if method == "wang" else WANG_ONLY
-    for name in others:
+    _refuse(context, others, f"not an option of --method {method}")
+    return {name: value for name, value in options.items() if name not in others}
+
+
+def _refuse(context: click.Context, names: tuple[str, ...], why: str) -> None:
+    """Raise ConfigError if one of these options was given."""
+    for name in names:
         source = context.get_parameter_source(name)
         if source is not None and source.name == "COMMANDLINE":
-            raise ConfigError(f"--{name}: not an option of --method {method}; leave it out")
-    return {name: value for name, value in options.items() if name not in others}
+            raise ConfigError(f"--{name.replace('_', '-')}: {why}; leave it out")
 
 
 def _of_quilt(out: str, found: "Done") -> str:

@@ -31,6 +31,7 @@ from torchmeso.config_sections import (
     SkyConfig,
     SpotConfig,
     TruthConfig,
+    WangConfig,
     first_problem,
 )
 from torchmeso.errors import ConfigError, FormatError
@@ -41,6 +42,7 @@ from torchmeso.meso.mesostructure import Mesostructure
 from torchmeso.meso.sources import SUFFIXES
 from torchmeso.render.frame import FrameOptions
 from torchmeso.render.silhouette import Silhouette
+from torchmeso.synthesize.parameterize import SurfaceOptions
 
 
 def load(path: str | Path) -> Config:
@@ -189,6 +191,8 @@ def _fields(kind: Any) -> dict[str, Any]:
         "double_sh": DoubleShOptions,
         "sh_pca": ShPcaOptions,
         "lights": SpotConfig,
+        "surface": SurfaceOptions,
+        "wang": WangConfig,
     }
     if inspect.isclass(kind) and issubclass(kind, BaseModel):
         names = list(kind.model_fields)

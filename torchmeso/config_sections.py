@@ -7,7 +7,7 @@ Test: tests/test_config.py
 
 import inspect
 from collections.abc import Callable, Iterable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -35,6 +35,8 @@ from torchmeso.meso.mesostructure import Mesostructure, Rgb
 from torchmeso.meso.sources import SOURCES
 from torchmeso.render.frame import FrameOptions
 from torchmeso.render.scene import ShellOptions
+from torchmeso.synthesize.parameterize import SurfaceOptions
+from torchmeso.synthesize.wang import WangOptions
 from torchmeso.transport import light_sampling
 
 Vector = tuple[float, float, float]
@@ -91,6 +93,19 @@ GDMS = (".gdm.zarr", ".gdm.meso")
 """How files end that hold a GDM."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class WangConfig(WangOptions):
+    """Wang tiles that are cut from a material itself; see `synthesize.wang`.
+
+    Attributes:
+        bands: compare only harmonics below this degree, or so many eigen components; None = all.
+        seed: the same one gives the same tiles.
+    """
+
+    bands: int | None = None
+    seed: int = 0
+
+
 class MaterialConfig(Strict):
     """A mesostructure with how to bake and compress it; or a finished model; or a plain colour with pictures.
 
@@ -98,7 +113,8 @@ class MaterialConfig(Strict):
     `rank` reads only that many components of a model; the others stay on disk. `albedo` multiplies `albedo_map`.
     With `gdm` the mesostructure stands as material of any form in a `shell` instead, above a `floor` of that colour; a
     `model` may be a GDM too, as baked (.gdm.zarr) or compressed (.gdm.meso). `quilting` is a map (.quilt) that lays
-    out BTF, MDF and pictures; texture coordinates stay those of the exemplar.
+    out BTF, MDF and pictures; texture coordinates stay those of the exemplar. `wang` cuts tiles from the material
+    itself, and `quilting` may be a set of tiles (.tiles) too: for objects that are laid out in quads (`surface`).
     """
 
     meso: MesoConfig | None = None
@@ -117,6 +133,7 @@ class MaterialConfig(Strict):
     shell: ShellOptions = Field(default_factory=ShellOptions)
     floor: Rgb = (0.6, 0.6, 0.6)
     quilting: str | None = None
+    wang: WangConfig | None = None
 
     @model_validator(mode="after")
     def _check(self) -> "MaterialConfig":
@@ -135,9 +152,16 @@ class MaterialConfig(Strict):
             raise ValueError("'shell' and 'floor' belong to a 'gdm' or to a 'model' that is one (.gdm.zarr, .gdm.meso)")
         if self.quilting is not None and (self.in_shell or (plain and not (self.albedo_map or self.normal_map))):
             raise ValueError("'quilting' lays out a BTF, an MDF or pictures; a GDM and a plain colour have none")
+        if self.wang is not None and (self.quilting is not None or self.in_shell or (plain and not self.albedo_map)):
+            raise ValueError("'wang' cuts tiles from a BTF or an 'albedo_map', in place of a 'quilting'")
         if self.rank is not None and self.model is None:
             raise ValueError("'rank' belongs to a 'model'; a 'meso' has 'eigen: {rank: ...}'")
         return self
+
+    @property
+    def tiled(self) -> bool:
+        """Whether it is laid out by tiles."""
+        return self.wang is not None or (self.quilting is not None and self.quilting.lower().endswith(".tiles"))
 
     @property
     def in_shell(self) -> bool:
@@ -194,7 +218,8 @@ class ObjectConfig(PlaceConfig):
     parts without either look as their file says. `regions` give materials to faces by where they lie, later ones over
     earlier ones. `uv_set` chooses among a glTF file's texture coordinates; `unwrap`
     (true, or options of the atlas) makes new ones at one `tile_size`. `instances` are further places, each applied
-    after the object's own; the mesh is read once.
+    after the object's own; the mesh is read once. `surface` lays the mesh out in quads, for a material of tiles; a
+    mesh may be a surface (.surface) that was laid out before.
     """
 
     material: str | None = None
@@ -208,6 +233,7 @@ class ObjectConfig(PlaceConfig):
     tile_size: float | None = None
     instances: list[PlaceConfig] = Field(default_factory=list)
     regions: list[RegionConfig] = Field(default_factory=list)
+    surface: SurfaceOptions | None = None
 
     @model_validator(mode="after")
     def _check(self) -> "ObjectConfig":
@@ -226,7 +252,16 @@ class ObjectConfig(PlaceConfig):
             raise ValueError("'options' belong to built-in shapes")
         if self.unwrap and (self.mesh is None or self.tile_size is None):
             raise ValueError("'unwrap' makes texture coordinates for a 'mesh' and needs 'tile_size' (world units)")
+        if self.in_quads and (self.mesh is None or self.material is None or self.materials or self.regions):
+            raise ValueError("a mesh laid out in quads ('surface', or a .surface file) has one 'material', of tiles")
+        if self.in_quads and (self.unwrap or self.tiles is not None or self.uv_set):
+            raise ValueError("quads take the place of 'unwrap', 'tiles' and 'uv_set'; leave these out")
         return self
+
+    @property
+    def in_quads(self) -> bool:
+        """Whether it is laid out in quads, a tile each."""
+        return self.surface is not None or (self.mesh is not None and self.mesh.lower().endswith(".surface"))
 
     def build_shape(self) -> Mesh:
         """Return the built-in shape, before it is placed.
@@ -417,6 +452,13 @@ class Config(Strict):
         for name in sorted(set().union(*(item.used_materials for item in self.objects))):
             if name not in self.materials:
                 raise ValueError(f"objects: no material is called '{name}'{did_you_mean(name, self.materials)}")
+        for item in self.objects:
+            for name in item.used_materials:
+                if item.in_quads != self.materials[name].tiled:
+                    raise ValueError(
+                        f"objects: material '{name}' and its object must both be of tiles: 'wang' or 'quilting' "
+                        "(.tiles) of the one, 'surface' or a .surface file of the other"
+                    )
         return self
 
 

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from tests.synthesize.test_tiling import tiles
-from torchmeso.errors import ShapeError
+from torchmeso.errors import GeometryError, ShapeError
 from torchmeso.synthesize.quad_tiling import _edges, classes, lay, turns
 
 CUBE = torch.tensor([[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]])
@@ -108,7 +108,7 @@ def test_bad_meshes_are_named():
         lay(torch.zeros(2, 3, dtype=torch.long), tiles("edges"))
     with pytest.raises(ShapeError, match=r"expected four different vertices, got \[0, 1, 1, 2\] at face 0"):
         lay(torch.tensor([[0, 1, 1, 2]]), tiles("edges"))
-    with pytest.raises(ShapeError, match="expected two faces at an edge, got more at face 0"):
+    with pytest.raises(GeometryError, match="expected at most two at an edge, got more beside face 0"):
         lay(torch.tensor([[0, 1, 2, 3], [1, 0, 4, 5], [0, 1, 6, 7]]), tiles("edges"))
     with pytest.raises(ShapeError, match="got face 1 turned over; flip it"):
         lay(torch.tensor([[0, 1, 2, 3], [0, 1, 4, 5]]), tiles("edges"))

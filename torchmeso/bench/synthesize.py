@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchmeso.bench import frames, graphcut, speed, wang
+from torchmeso.bench import frames, graphcut, speed, surfaces, wang
 from torchmeso.bench.suite import Context, Measurement, Row
 from torchmeso.bench.timing import time_together
 from torchmeso.config import data_dir
@@ -253,4 +253,7 @@ MEASUREMENTS = [
     Measurement("tiles.relit", tile_seams),
     Measurement("synthesize.seams", seam_energy),
     Measurement("synthesize.frame", frame_cost),
+    Measurement("surface.seams", surfaces.seams),
+    Measurement("surface.redress", surfaces.re_dressing),
+    Measurement("surface.frame", surfaces.frame_cost),
 ]

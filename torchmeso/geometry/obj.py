@@ -11,6 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Float, Int
+from torch import Tensor
 
 from torchmeso.errors import FormatError, GeometryError
 from torchmeso.geometry.mesh_file import Finish, Group, MeshFile
@@ -48,6 +50,47 @@ def read(path: Path) -> MeshFile:
         groups=tuple(Group(name, looks.get(name)) for name in lines.names),
         uv_sets=int(uv is not None),
     )
+
+
+class Polygons(NamedTuple):
+    """The polygons of a file, as they stand there.
+
+    Attributes:
+        vertices: (V, 3) float64.
+        places: (W, 3) texture coordinates, the third 0 where there is none; float64.
+        size: (F,) corners of each polygon.
+        vertex: (sum of sizes) vertex of each corner.
+        place: (sum of sizes) texture coordinate of each corner; -1 where it has none.
+    """
+
+    vertices: Float[Tensor, "V 3"]
+    places: Float[Tensor, "W 3"]
+    size: Int[Tensor, "F"]
+    vertex: Int[Tensor, "n"]
+    place: Int[Tensor, "n"]
+
+
+def read_polygons(path: Path) -> Polygons:
+    """Return the polygons of an OBJ file.
+
+    Raises:
+        FormatError: a line cannot be read.
+        GeometryError: a face names a vertex that is not there, or a coordinate is not finite.
+    """
+    text = path.read_text(encoding="utf-8", errors="replace").replace("\\\n", " ")
+    try:
+        lines = _scan(text)
+        size = np.array([len(p.split()) for p in lines.polygons], dtype=np.int64)
+        corner = _corners(lines.polygons, size) - 1 if len(size) else np.zeros((0, 2), dtype=np.int64)
+        places, vertices = _columns(lines.textures, 3), _columns(lines.positions, 3)
+    except (ValueError, IndexError, OverflowError) as error:
+        raise FormatError(f"{path}: expected an OBJ file ({error})") from error
+    if len(corner) and not (corner[:, 0].min() >= 0 and (corner.max(0) < (len(vertices), max(len(places), 1))).all()):
+        raise GeometryError(f"{path.name}: expected faces of vertices 1 to {len(vertices)}, got others")
+    if not (np.isfinite(vertices).all() and np.isfinite(places).all()):
+        raise GeometryError(f"{path.name}: expected finite coordinates, got NaN or infinity")
+    vertex, place = torch.from_numpy(corner.copy()).unbind(1)
+    return Polygons(torch.from_numpy(vertices), torch.from_numpy(places), torch.from_numpy(size), vertex, place)
 
 
 class _Lines(NamedTuple):

@@ -14,6 +14,8 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import torch
+
 from torchmeso.compress import factored, stream
 from torchmeso.compress.double_sh import DoubleShOptions
 from torchmeso.compress.eigen import EigenOptions
@@ -26,6 +28,7 @@ from torchmeso.data import (
     gdm,
     gdm_coded,
     gdm_svd,
+    image,
     journal,
     mdf,
     quilting_map,
@@ -33,12 +36,18 @@ from torchmeso.data import (
     sh_pca_btf,
     store,
     textured,
+    tile_atlas,
+    tile_set,
     transform_btf,
 )
+from torchmeso.data.textured import Textured
+from torchmeso.data.tile_set import TileSet
 from torchmeso.errors import ConfigError, FormatError
 from torchmeso.geometry.mesh_file import Finish
 from torchmeso.meso import bake_btf, bake_gdm, bake_mdf
 from torchmeso.render.scene import Material, quilted
+from torchmeso.synthesize import patch_error, wang
+from torchmeso.synthesize.patch_error import Metric
 
 Report = Callable[[str, float], None]
 """Called with what is being done and the share done, 0..1."""
@@ -56,12 +65,14 @@ class Asset:
         seconds: wall time by step, empty where everything came from the cache.
         raw_bytes: BTF and MDF on disk before compression; 0 where no table was baked.
         model_bytes: the run-time model.
+        tiles: what lays the material out, where it is tiles.
     """
 
     material: Material
     seconds: dict[str, float]
     raw_bytes: int
     model_bytes: int
+    tiles: TileSet | None = None
 
 
 def silent(what: str, share: float) -> None:
@@ -84,9 +95,43 @@ def prepare(config: Config, report: Report = silent) -> dict[str, Asset]:
 def prepare_material(name: str, material: MaterialConfig, report: Report = silent, *, depth: bool = True) -> Asset:
     """Return one material, baked and compressed or from the cache; without `depth` its MDF stays on disk."""
     asset = _prepare(name, material, report, depth=depth)
+    if material.tiled:
+        tiles = _tiles(name, material, asset.material, report)
+        return replace(asset, material=quilted(asset.material, tile_atlas.build(tiles).map), tiles=tiles)
     if material.quilting is None:
         return asset
     return replace(asset, material=quilted(asset.material, quilting_map.load(material.quilting)))
+
+
+def _tiles(name: str, material: MaterialConfig, look: Material, report: Report) -> TileSet:
+    """Return the tiles that lay a material out: from their file, or cut from it and kept by content."""
+    if material.wang is None:
+        assert material.quilting is not None
+        return tile_set.load(material.quilting)
+    path = tiles_path(material)
+    if path.exists():
+        return tile_set.load(path)
+    made_from = image.to_srgb(look.btf.albedo) if isinstance(look.btf, Textured) else look.btf
+    assert isinstance(made_from, patch_error.Look)
+    report(f"{name}: tiles", 0)
+    source = patch_error.exemplar(made_from, Metric(bands=material.wang.bands))
+    rng, told = torch.Generator().manual_seed(material.wang.seed), partial(report, f"{name}: tiles")
+    found = wang.grow(source, material.wang, rng=rng, backend="auto", progress=told).set
+    tile_set.save(found, path, seed=material.wang.seed)
+    return found
+
+
+def tiles_path(material: MaterialConfig) -> Path:
+    """Return where the cache keeps the tiles that are cut from a material."""
+    if material.finish is not None:
+        made_from: object = [file_hash(material.albedo_map or ""), material.albedo]
+    elif material.model is not None:
+        made_from = [file_hash(material.model), material.rank]
+    else:
+        made_from = model_path(material).name
+    assert material.wang is not None
+    about = [made_from, asdict(material.wang), code_hash(("synthesize",))]
+    return store.cache_dir() / f"{store.content_hash(*about)}.tiles"
 
 
 def _prepare(name: str, material: MaterialConfig, report: Report, *, depth: bool) -> Asset:

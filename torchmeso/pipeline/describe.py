@@ -25,6 +25,7 @@ from torchmeso.data import (
     rti,
     store,
     tile_set,
+    tiled_surface,
 )
 from torchmeso.errors import FormatError, human_size
 from torchmeso.geometry import mesh, mesh_file, unwrap
@@ -58,6 +59,8 @@ def file(path: str | Path) -> dict[str, Any]:
         return {**quilting_map.describe(path), "on disk": _size(path)}
     if name.endswith(".tiles"):
         return {**tile_set.describe(path), "on disk": _size(path)}
+    if name.endswith(".surface"):
+        return {**tiled_surface.describe(path), "on disk": _size(path)}
     if name.endswith((".lp", ".ptm", ".rti")):
         return _rti(path)
     if name.endswith((".yaml", ".yml")):
@@ -69,8 +72,8 @@ def file(path: str | Path) -> dict[str, Any]:
         return _mesh(path)
     raise FormatError(
         f"{path}: expected a table (.btf.zarr, .mdf.zarr, .gdm.zarr, .btf), a model (.meso), "
-        "a quilting map (.quilt), tiles (.tiles), a configuration (.yaml), a folder or zip of the pictures of a BTF, "
-        "an RTI file (.lp, .ptm, .rti), a picture or a mesh"
+        "a quilting map (.quilt), tiles (.tiles), a surface (.surface), a configuration (.yaml), a folder or zip of "
+        "the pictures of a BTF, an RTI file (.lp, .ptm, .rti), a picture or a mesh"
     )
 
 

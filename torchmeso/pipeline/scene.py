@@ -12,12 +12,16 @@ from jaxtyping import Int
 from torch import Tensor
 
 from torchmeso.config_sections import Config, ObjectConfig
+from torchmeso.data import tiled_surface
+from torchmeso.data.tile_set import TileSet
 from torchmeso.errors import ConfigError, did_you_mean
 from torchmeso.geometry import mesh, mesh_file, unwrap
 from torchmeso.geometry.mesh import Mesh
 from torchmeso.geometry.mesh_file import Finish, Group, MeshFile
+from torchmeso.pipeline import dress
 from torchmeso.pipeline.bake import Asset, plain
 from torchmeso.render.scene import Material, Object, Scene
+from torchmeso.synthesize.parameterize import SurfaceOptions
 
 
 class Body(NamedTuple):
@@ -50,7 +54,8 @@ def build(config: Config, assets: dict[str, Asset]) -> Scene:
         return found[look]
 
     objects = []
-    for item, body in zip(config.objects, read_bodies(config), strict=True):
+    tiles = {name: asset.tiles for name, asset in assets.items() if asset.tiles is not None}
+    for item, body in zip(config.objects, read_bodies(config, tiles), strict=True):
         first, *others = (material(look) for look in body.looks)
         objects += [
             Object(mesh=mesh.transform(body.mesh, matrix), material=first, others=tuple(others), part=body.part)
@@ -76,8 +81,12 @@ def bare(scene: Scene) -> Scene:
     )
 
 
-def read_bodies(config: Config) -> list[Body]:
+def read_bodies(config: Config, tiles: dict[str, TileSet] | None = None) -> list[Body]:
     """Return the body of each object of `config`; those that ask for the same are read once.
+
+    Args:
+        config: the configuration.
+        tiles: those of materials that are laid out by tiles.
 
     Raises:
         MesoError: a file is missing or unreadable, has no texture coordinates, or a part has no material.
@@ -87,13 +96,13 @@ def read_bodies(config: Config) -> list[Body]:
     for item in config.objects:
         key = item.model_dump_json(exclude={"scale", "rotate_deg", "translate", "instances"})
         if key not in kept:
-            kept[key] = read_body(item)
+            kept[key] = read_body(item, (tiles or {}).get(str(item.material)))
         bodies.append(kept[key])
     return bodies
 
 
-def read_body(item: ObjectConfig) -> Body:
-    """Return the mesh of an object, not yet placed, and what its parts look like.
+def read_body(item: ObjectConfig, tiles: TileSet | None = None) -> Body:
+    """Return the mesh of an object, not yet placed, and what its parts look like; `tiles` lie on one in quads.
 
     Raises:
         MesoError: the file is missing or unreadable, has no texture coordinates, or a part has no material.
@@ -102,6 +111,8 @@ def read_body(item: ObjectConfig) -> Body:
         assert item.material is not None
         return _in_regions(item, Body(item.build_shape(), None, (item.material,)))
     assert item.mesh is not None
+    if item.in_quads:
+        return _in_quads(item, tiles)
     found = mesh_file.read(item.mesh, uv_set=item.uv_set)
     looks = _looks(item, found.groups)
     if item.unwrap:
@@ -110,6 +121,18 @@ def read_body(item: ObjectConfig) -> Body:
     kinds = list(dict.fromkeys(looks))
     part = torch.tensor([kinds.index(look) for look in looks])[part]
     return _in_regions(item, Body(dressed, part if len(kinds) > 1 else None, tuple(kinds)))
+
+
+def _in_quads(item: ObjectConfig, tiles: TileSet | None) -> Body:
+    """Return a body that is laid out in quads, a tile each."""
+    assert item.mesh is not None and item.material is not None
+    if tiles is None:
+        raise ConfigError(
+            f"objects: {item.mesh} is laid out in tiles, which this cannot show; render the configuration"
+        )
+    surface = dress.surface(item.mesh, tiles, item.surface or SurfaceOptions())
+    dressed = tiled_surface.dress(tiled_surface.base(surface, item.mesh), surface, tiles)
+    return Body(dressed.mesh, None, (item.material,))
 
 
 def _in_regions(item: ObjectConfig, body: Body) -> Body:

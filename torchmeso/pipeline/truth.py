@@ -10,7 +10,7 @@ Test: tests/pipeline/test_truth.py
 import hashlib
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import torch
@@ -18,7 +18,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchmeso.config_sections import Config, MaterialConfig, ObjectConfig
-from torchmeso.data import store, textured
+from torchmeso.data import store, textured, tile_atlas
+from torchmeso.data.quilting_map import QuiltingMap
+from torchmeso.data.tile_set import TileSet
 from torchmeso.errors import ConfigError
 from torchmeso.geometry.camera import Camera
 from torchmeso.geometry.light import Light, illuminate
@@ -26,7 +28,7 @@ from torchmeso.geometry.mesh import Mesh
 from torchmeso.geometry.mesh_file import Finish, Picture
 from torchmeso.meso.displace import displace
 from torchmeso.meso.mesostructure import Mesostructure, palette
-from torchmeso.pipeline.bake import Report, code_hash, describe_meso, file_hash, silent
+from torchmeso.pipeline.bake import Report, code_hash, describe_meso, file_hash, prepare_material, silent
 from torchmeso.pipeline.scene import Body, read_bodies, read_body
 from torchmeso.transport import light_sampling
 from torchmeso.transport.path import radiance
@@ -86,12 +88,20 @@ def geometries(config: Config) -> list[Geometry]:
 def _surfaces(config: Config) -> Iterator[tuple[int, Geometry]]:
     """Yield geometries with the number of the object that each belongs to, as `pipeline.scene` counts them."""
     mesos = {name: m.meso.build() for name, m in config.materials.items() if m.meso is not None}
+    tiles = {}
+    for name, m in config.materials.items():
+        if m.tiled and m.meso is not None:
+            raise ConfigError(
+                f"truth: '{name}' is laid out by tiles, its mesostructure by none; only pictures are both"
+            )
+        if m.tiled and (found := prepare_material(name, m).tiles) is not None:
+            tiles[name] = found
     first = 0
-    for item, body in zip(config.objects, read_bodies(config), strict=True):
+    for item, body in zip(config.objects, read_bodies(config, tiles), strict=True):
         places = item.places()
         # A similarity carries displaced triangles as it carries the mesh: each body is displaced once.
         for k, look in enumerate(body.looks):
-            for geometry in _geometries(config, mesos, _only(body, k), look):
+            for geometry in _geometries(config, mesos, _only(body, k), look, tiles.get(str(look))):
                 for i, matrix in enumerate(places):
                     vertices = geometry.vertices.double() @ matrix[:3, :3].double().T + matrix[:3, 3].double()
                     yield first + i, replace(geometry, vertices=vertices.float())
@@ -106,11 +116,14 @@ def _only(body: Body, k: int) -> Mesh:
     return replace(body.mesh, faces=body.mesh.faces[mine], component=body.mesh.component[mine])
 
 
-def _geometries(config: Config, mesos: dict[str, Mesostructure], body: Mesh, look: str | Finish) -> Iterator[Geometry]:
+def _geometries(
+    config: Config, mesos: dict[str, Mesostructure], body: Mesh, look: str | Finish, tiles: TileSet | None
+) -> Iterator[Geometry]:
     """Yield what a body is made of: its surface, displaced, and the floor of a solid shell."""
     material = config.materials[look] if isinstance(look, str) else None
     if material is None or material.gdm is None:
-        yield _geometry(config, mesos, body, look)
+        geometry = _geometry(config, mesos, body, look)
+        yield geometry if tiles is None else _laid_out(geometry, tile_atlas.build(tiles).map)
         return
     h = mesos[str(look)].h
     lift = h if material.shell.side == "outward" else 0.0
@@ -154,6 +167,13 @@ def _geometry(config: Config, mesos: dict[str, Mesostructure], body: Mesh, look:
         albedo_map=colours.albedo,
         uv=body.uv,
     )
+
+
+def _laid_out(geometry: Geometry, quilting: QuiltingMap) -> Geometry:
+    """Return triangles whose picture is laid out by a map, once for all of it."""
+    assert geometry.albedo_map is not None and geometry.uv is not None
+    uv = geometry.uv / torch.tensor(quilting.periods)
+    return replace(geometry, albedo_map=quilting.apply(geometry.albedo_map), uv=uv)
 
 
 def first_hits(
@@ -228,4 +248,5 @@ def _describe(material: MaterialConfig) -> object:
         in_shell = [material.shell.side, material.shell.base, material.floor]
         return meso if material.gdm is None else [meso, in_shell]
     pictures = [file_hash(p) for p in (material.albedo_map, material.normal_map) if p is not None]
-    return [material.albedo, *pictures]
+    laid = None if material.wang is None else asdict(material.wang)
+    return [material.albedo, laid, *pictures, *([file_hash(material.quilting)] if material.quilting else [])]

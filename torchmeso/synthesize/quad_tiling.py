@@ -22,7 +22,10 @@ from jaxtyping import Int
 from torch import Tensor
 
 from torchmeso.data.tile_set import TileSet
+from torchmeso.data.tiled_surface import TiledSurface
 from torchmeso.errors import ShapeError
+from torchmeso.geometry import quads
+from torchmeso.geometry.quads import Patches
 from torchmeso.synthesize.tiling import alphabet, hashed
 
 SIDES = 4
@@ -30,6 +33,9 @@ SIDES = 4
 
 ORDER = (2, 1, 0, 3)
 """Where north, east, south and west, the order of a tile's colours, stand among these."""
+
+STARTS = 8
+"""Quads that frames are grown from, one after the other."""
 
 ROUNDS = 32
 """Most times that all quads are looked at for a better turn."""
@@ -58,7 +64,8 @@ def lay(faces: Int[Tensor, "F 4"], tiles: TileSet, *, seed: int = 0) -> Tiling:
         seed: of the hash.
 
     Raises:
-        ShapeError: a face is no quad, or the mesh is no surface with one outside.
+        ShapeError: a face is no quad, or turned over.
+        GeometryError: an edge has more than two faces.
         ConfigError: the set lacks a combination.
     """
     edges, beside = _edges(faces)
@@ -88,6 +95,28 @@ def lay(faces: Int[Tensor, "F 4"], tiles: TileSet, *, seed: int = 0) -> Tiling:
     return Tiling(tiles.find(colours), turn, _jumps(beside, turn))
 
 
+def arrange(patches: Patches, tiles: TileSet, *, seed: int = 0) -> TiledSurface:
+    """Return a surface laid out for all sets of the kind of `tiles`; arguments and errors as for `lay`."""
+    found = lay(patches.quads, tiles, seed=seed)
+    a, b = patches.place.unbind(-1)
+    by = found.turn[patches.cell, None]
+    # South-west is the quad's corner 0, 1, 2 or 3.
+    east = torch.where(by == 0, a, torch.where(by == 1, b, torch.where(by == 2, 1 - a, 1 - b)))
+    north = torch.where(by == 0, b, torch.where(by == 1, 1 - a, torch.where(by == 2, 1 - b, a)))
+    jumps = found.jumps.clone()
+    jumps[:, 1] = (jumps[:, 1] - found.turn[jumps[:, 0]]) % SIDES
+    return TiledSurface(
+        vertices=patches.vertices,
+        faces=patches.faces,
+        cell=patches.cell,
+        place=torch.stack([east, north], -1),
+        quads=patches.quads.gather(1, (torch.arange(SIDES) + found.turn[:, None]) % SIDES),
+        colours=tiles.colours[found.tile],
+        jumps=jumps,
+        marks=tiles.marks,
+    )
+
+
 def _drawn(number: Tensor, owner: Tensor, which: int, letters: list[int], seed: int) -> Tensor:
     return torch.tensor(letters)[hashed(number, owner, which, seed) * len(letters) >> 32]
 
@@ -96,23 +125,17 @@ def _edges(faces: Int[Tensor, "F 4"]) -> tuple[Int[Tensor, "F 4"], Int[Tensor, "
     """Return the number of the edge at each side, and the side beyond it, face * 4 + side; -1 at a border."""
     if faces.ndim != 2 or faces.shape[1] != SIDES or faces.dtype.is_floating_point:
         raise ShapeError(f"faces: expected quads, whole numbers (F, 4), got {tuple(faces.shape)} of {faces.dtype}")
-    ends = torch.stack([faces, faces.roll(-1, 1)], -1).flatten(0, 1)
-    if bool((ends[:, 0] == ends[:, 1]).any()):
-        face = int((ends[:, 0] == ends[:, 1]).nonzero()[0]) // SIDES
+    if bool((faces == faces.roll(-1, 1)).any()):
+        face = int((faces == faces.roll(-1, 1)).any(1).nonzero()[0])
         raise ShapeError(f"faces: expected four different vertices, got {faces[face].tolist()} at face {face}")
-    _, edge, count = ends.sort(1).values.unique(dim=0, return_inverse=True, return_counts=True)
-    beside = torch.full((len(ends),), -1)
-    order = edge.argsort(stable=True)
-    first = torch.cat([count.new_zeros(1), count.cumsum(0)[:-1]])
-    if bool((count > 2).any()):
-        face = int(order[first[count > 2][0]]) // SIDES
-        raise ShapeError(f"faces: expected two faces at an edge, got more at face {face}")
-    a, b = order[first[count == 2]], order[first[count == 2] + 1]
-    if bool((ends[a, 0] == ends[b, 0]).any()):
-        face = int(b[ends[a, 0] == ends[b, 0]][0]) // SIDES
+    found = quads.edges(faces)
+    if bool(found.along.any()):
+        # Of the two the later one.
+        face = int(
+            (found.along & (found.beside < torch.arange(faces.numel()).reshape(faces.shape))).any(1).nonzero()[0]
+        )
         raise ShapeError(f"faces: expected all anticlockwise from outside, got face {face} turned over; flip it")
-    beside[a], beside[b] = b, a
-    return edge.reshape(faces.shape), beside.reshape(faces.shape)
+    return found.number, found.beside
 
 
 def _quarter(beside: Int[Tensor, "F 4"], turn: Int[Tensor, "F"]) -> Int[Tensor, "F 4"]:
@@ -131,10 +154,18 @@ def _jumps(beside: Int[Tensor, "F 4"], turn: Int[Tensor, "F"]) -> Int[Tensor, "n
 
 
 def turns(beside: Int[Tensor, "F 4"]) -> Int[Tensor, "F"]:
-    """Return how each quad is turned, so that few frames turn across edges."""
+    """Return how each quad is turned, so that few frames turn across edges: the best of several beginnings."""
     near = beside.tolist()
+    begun = [len(near) * k // STARTS for k in range(STARTS)] if len(near) > STARTS else list(range(len(near)))[:1]
+    tried = [torch.tensor(_grown(near, k), dtype=torch.long) for k in begun] or [torch.zeros(0, dtype=torch.long)]
+    jumps = [int((_quarter(beside, turn) != 0).sum()) for turn in tried]
+    return tried[jumps.index(min(jumps))]
+
+
+def _grown(near: list[list[int]], first: int) -> list[int]:
+    """Return frames that were grown from quad to quad, and then turned one by one while that helps."""
     turn = [-1] * len(near)
-    for start in range(len(near)):
+    for start in (first, *range(len(near))):
         if turn[start] >= 0:
             continue
         turn[start] = 0
@@ -157,7 +188,7 @@ def turns(beside: Int[Tensor, "F 4"]) -> Int[Tensor, "F"]:
                 turn[face], changed = votes.index(best), True
         if not changed:
             break
-    return torch.tensor(turn, dtype=torch.long)
+    return turn
 
 
 def _agreeing(side: int, other: int, turn: int) -> int:
