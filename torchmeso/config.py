@@ -23,6 +23,7 @@ from torchmeso.config_sections import (
     CameraConfig,
     Config,
     EnvironmentConfig,
+    FeatureConfig,
     MaterialConfig,
     MesoConfig,
     ObjectConfig,
@@ -137,7 +138,7 @@ def data_dir() -> Path:
     return Path(os.environ.get("TORCHMESO_DATA", beside))
 
 
-PATH_KEYS = ("map", "mesh", "model", "displacement", "albedo", "albedo_map", "normal_map", "path", "quilting")
+PATH_KEYS = ("map", "mesh", "model", "displacement", "albedo", "albedo_map", "normal_map", "path", "quilting", "mask")
 
 
 def _resolve(content: Any, folder: Path) -> Any:
@@ -193,6 +194,7 @@ def _fields(kind: Any) -> dict[str, Any]:
         "lights": SpotConfig,
         "surface": SurfaceOptions,
         "wang": WangConfig,
+        "features": FeatureConfig,
     }
     if inspect.isclass(kind) and issubclass(kind, BaseModel):
         names = list(kind.model_fields)

@@ -19,6 +19,7 @@ from torchmeso.compress.double_sh import DoubleShOptions
 from torchmeso.compress.eigen import EigenOptions
 from torchmeso.compress.sh_pca import ShPcaOptions
 from torchmeso.data import environment as environments
+from torchmeso.data import image
 from torchmeso.data import sky as skies
 from torchmeso.data.environment import Environment
 from torchmeso.errors import ConfigError, MesoError, did_you_mean
@@ -36,7 +37,7 @@ from torchmeso.meso.sources import SOURCES
 from torchmeso.render.frame import FrameOptions
 from torchmeso.render.scene import ShellOptions
 from torchmeso.synthesize.parameterize import SurfaceOptions
-from torchmeso.synthesize.wang import WangOptions
+from torchmeso.synthesize.wang import Feature, WangOptions
 from torchmeso.transport import light_sampling
 
 Vector = tuple[float, float, float]
@@ -93,6 +94,39 @@ GDMS = (".gdm.zarr", ".gdm.meso")
 """How files end that hold a GDM."""
 
 
+class FeatureConfig(Strict):
+    """A part of the exemplar that is put on an edge or into a tile and stays; see `synthesize.wang.Feature`.
+
+    A rectangle of `size` (rows, columns), or what is brighter than half in a picture `mask`.
+    """
+
+    on: Literal["horizontal", "vertical", "tile"]
+    number: int = Field(ge=0)
+    at: tuple[int, int]
+    taken: tuple[int, int]
+    size: tuple[int, int] | None = None
+    mask: str | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> "FeatureConfig":
+        if (self.size is None) == (self.mask is None):
+            raise ValueError("expected exactly one of 'size' (rows, columns) and 'mask' (a picture)")
+        if self.size is not None and min(self.size) < 1:
+            raise ValueError(f"'size': expected at least one row and column, got {self.size}")
+        return self
+
+    def build(self) -> Feature:
+        """Return the feature.
+
+        Raises:
+            FormatError: the mask is missing or unreadable.
+        """
+        mask = torch.ones(self.size or (1, 1), dtype=torch.bool)
+        if self.mask is not None:
+            mask = image.to_srgb(image.read(self.mask)).mean(-1) > 0.5
+        return Feature(on=self.on, number=self.number, at=self.at, taken=self.taken, mask=mask)
+
+
 @dataclass(frozen=True, kw_only=True)
 class WangConfig(WangOptions):
     """Wang tiles that are cut from a material itself; see `synthesize.wang`.
@@ -100,10 +134,14 @@ class WangConfig(WangOptions):
     Attributes:
         bands: compare only harmonics below this degree, or so many eigen components; None = all.
         seed: the same one gives the same tiles.
+        corners: first row and column of each corner sample in the exemplar, chosen by hand.
+        features: what is put somewhere and stays.
     """
 
     bands: int | None = None
     seed: int = 0
+    corners: tuple[tuple[int, int], ...] | None = None
+    features: tuple[FeatureConfig, ...] = ()
 
 
 class MaterialConfig(Strict):

@@ -7,7 +7,7 @@ from tests.synthesize.test_parameterize import CORNERS, write
 from tests.synthesize.test_quad_tiling import CUBE
 from torchmeso import config
 from torchmeso.cli import main
-from torchmeso.data import image, tiled_surface
+from torchmeso.data import image, tile_set, tiled_surface
 from torchmeso.errors import ConfigError
 from torchmeso.pipeline import bake, describe, scene, truth
 from torchmeso.pipeline.render import Painter
@@ -109,3 +109,43 @@ def test_bad_arguments_are_one_sentence(folder):
     ):
         with pytest.raises(ConfigError, match=text.replace("(", "\\(")):
             settings(folder, material, body)
+
+
+def test_features_and_corner_samples_by_hand_are_on_the_tiles(folder):
+    """The same rectangle of the exemplar in the middle of every fourth tile, and corners where they were asked for."""
+    corners = [[0, 0], [0, 12], [12, 0], [12, 12]]
+    features = [{"on": "tile", "number": k, "at": [6, 6], "taken": [3, 4], "size": [4, 5]} for k in range(0, 96, 4)]
+    image.write_png(folder / "mask.png", torch.ones(2, 2, 3))
+    on_edge = {"on": "horizontal", "number": 1, "at": [3, 7], "taken": [10, 10], "mask": "mask.png"}
+    wanted = settings(
+        folder, {"wang": {**TILES, "corners": corners, "features": [*features, on_edge]}}, {"surface": {}}
+    )
+    shown = bake.prepare(wanted)["m"].tiles.shown()
+    rows, columns = torch.meshgrid(torch.arange(3, 7), torch.arange(4, 9), indexing="ij")
+    assert bool((shown[::4, 6:10, 6:11] == rows * 28 + columns).all())
+    # An edge's lower half is the upper half of the tiles below it; a feature across it is on tiles above and below.
+    north = tile_set_colours(folder)[:, 0] == 1
+    assert bool((shown[north][:, 0, 7:9] == torch.tensor([11 * 28 + 10, 11 * 28 + 11])).all())
+    # The right half of the corner sample's lower half is where tiles begin.
+    assert bool((shown[:, 0, 1:3] >= 0).all())
+
+
+def tile_set_colours(folder):
+    return tile_set.load(folder / "a.tiles").colours
+
+
+@pytest.mark.errors
+def test_features_without_room_are_one_sentence(folder):
+    base = {"on": "tile", "number": 0, "at": [6, 6], "taken": [3, 4]}
+    for feature, text in (
+        ({**base, "size": [4, 40]}, "feature: expected to find room on tile 0"),
+        ({**base, "at": [0, 6], "size": [2, 2]}, "feature: expected to find room on tile 0"),
+        ({**base, "taken": [22, 4], "size": [4, 4]}, "feature: expected texels of the exemplar, 28 x 24"),
+        ({**base, "number": 96, "size": [2, 2]}, "feature: expected some texels on one of"),
+    ):
+        with pytest.raises(ConfigError, match=text):
+            bake.prepare(settings(folder, {"wang": {**TILES, "features": [feature]}}, {"surface": {}}))
+    with pytest.raises(ConfigError, match=r"expected exactly one of 'size' .* and 'mask'"):
+        settings(folder, {"wang": {**TILES, "features": [base]}}, {"surface": {}})
+    with pytest.raises(ConfigError, match=r"wang\.corners: expected 4 places"):
+        bake.prepare(settings(folder, {"wang": {**TILES, "corners": [[0, 0]]}}, {"surface": {}}))

@@ -116,7 +116,11 @@ def _tiles(name: str, material: MaterialConfig, look: Material, report: Report) 
     report(f"{name}: tiles", 0)
     source = patch_error.exemplar(made_from, Metric(bands=material.wang.bands))
     rng, told = torch.Generator().manual_seed(material.wang.seed), partial(report, f"{name}: tiles")
-    found = wang.grow(source, material.wang, rng=rng, backend="auto", progress=told).set
+    asked = material.wang
+    found = wang.grow(
+        source, asked, rng=rng, corners=None if asked.corners is None else torch.tensor(asked.corners),
+        features=tuple(feature.build() for feature in asked.features), backend="auto", progress=told,
+    ).set  # fmt: skip
     tile_set.save(found, path, seed=material.wang.seed)
     return found
 
@@ -130,7 +134,9 @@ def tiles_path(material: MaterialConfig) -> Path:
     else:
         made_from = model_path(material).name
     assert material.wang is not None
-    about = [made_from, asdict(material.wang), code_hash(("synthesize",))]
+    asked = {**asdict(material.wang), "features": [f.model_dump() for f in material.wang.features]}
+    masks = [file_hash(f.mask) for f in material.wang.features if f.mask is not None]
+    about = [made_from, asked, masks, code_hash(("synthesize",))]
     return store.cache_dir() / f"{store.content_hash(*about)}.tiles"
 
 

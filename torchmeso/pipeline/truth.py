@@ -10,7 +10,7 @@ Test: tests/pipeline/test_truth.py
 import hashlib
 import warnings
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -28,7 +28,7 @@ from torchmeso.geometry.mesh import Mesh
 from torchmeso.geometry.mesh_file import Finish, Picture
 from torchmeso.meso.displace import displace
 from torchmeso.meso.mesostructure import Mesostructure, palette
-from torchmeso.pipeline.bake import Report, code_hash, describe_meso, file_hash, prepare_material, silent
+from torchmeso.pipeline.bake import Report, code_hash, describe_meso, file_hash, prepare_material, silent, tiles_path
 from torchmeso.pipeline.scene import Body, read_bodies, read_body
 from torchmeso.transport import light_sampling
 from torchmeso.transport.path import radiance
@@ -248,5 +248,5 @@ def _describe(material: MaterialConfig) -> object:
         in_shell = [material.shell.side, material.shell.base, material.floor]
         return meso if material.gdm is None else [meso, in_shell]
     pictures = [file_hash(p) for p in (material.albedo_map, material.normal_map) if p is not None]
-    laid = None if material.wang is None else asdict(material.wang)
+    laid = None if material.wang is None else tiles_path(material).name
     return [material.albedo, laid, *pictures, *([file_hash(material.quilting)] if material.quilting else [])]
