@@ -54,7 +54,7 @@ def _opened(port: str, **options: Any) -> "Iterator[Rig]":
 @rig.command("list")
 def list_() -> None:
     """List the serial ports of this machine: name, what it is, serial number."""
-    from torchmeso.capture.rig import ports
+    from torchmeso.capture.link import ports
 
     for port in ports():
         click.echo("\t".join(port).rstrip())

@@ -1,7 +1,7 @@
 import pytest
 from click.testing import CliRunner
 
-from torchmeso.capture import rig, virtual
+from torchmeso.capture import link, virtual
 from torchmeso.capture.virtual import VirtualOptions
 from torchmeso.cli import main
 
@@ -48,7 +48,7 @@ def test_test_goes_through_everything(fast):
 
 
 def test_list(monkeypatch):
-    monkeypatch.setattr(rig, "ports", lambda: [("/dev/ttyUSB0", "table", "B2"), ("/dev/ttyS0", "", "")])
+    monkeypatch.setattr(link, "ports", lambda: [("/dev/ttyUSB0", "table", "B2"), ("/dev/ttyS0", "", "")])
     assert said("list") == (0, "/dev/ttyUSB0\ttable\tB2\n/dev/ttyS0\n")
 
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 import pytest
 import serial
 
+from torchmeso.capture import link, virtual
 from torchmeso.capture import rig as rigs
-from torchmeso.capture import virtual
 from torchmeso.capture.dialects import Pose
 from torchmeso.capture.rig import Rig, RigOptions
 from torchmeso.capture.virtual import VirtualOptions
@@ -80,7 +80,7 @@ def test_a_port_that_vanishes_is_said():
         rig_of = rig
     with pytest.raises(RigError, match=r"is gone|does not obey|no two reports|expected"):
         rig_of.move(Pose(1, 1, 1))
-    rig_of.line.close()
+    rig_of.link.close()
 
 
 def test_a_port_where_nobody_answers(monkeypatch):
@@ -96,14 +96,14 @@ def test_a_port_that_does_not_open():
 
 def test_ports_by_name_pattern_and_number(monkeypatch):
     known = [("/dev/ttyACM0", "arc", "A1"), ("/dev/ttyUSB0", "table", "B2"), ("/dev/ttyUSB1", "spare", "")]
-    monkeypatch.setattr(rigs, "ports", lambda: known)
-    assert rigs.find_port("B2") == "/dev/ttyUSB0"
-    assert rigs.find_port("/dev/ttyACM*") == "/dev/ttyACM0"
-    assert rigs.find_port("/dev/elsewhere") == "/dev/elsewhere"
+    monkeypatch.setattr(link, "ports", lambda: known)
+    assert link.find_port("B2") == "/dev/ttyUSB0"
+    assert link.find_port("/dev/ttyACM*") == "/dev/ttyACM0"
+    assert link.find_port("/dev/elsewhere") == "/dev/elsewhere"
     with pytest.raises(RigError, match="expected one port, got /dev/ttyUSB0, /dev/ttyUSB1"):
-        rigs.find_port("/dev/ttyUSB*")
+        link.find_port("/dev/ttyUSB*")
     with pytest.raises(RigError, match="no port is C3; ports of this machine: /dev/ttyACM0"):
-        rigs.find_port("C3")
+        link.find_port("C3")
 
 
 def test_options_out_of_range():

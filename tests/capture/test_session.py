@@ -11,11 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from torchmeso.capture import session
+from torchmeso.capture import plan, session
 from torchmeso.capture.cameras import Camera
 from torchmeso.capture.dialects import Pose
+from torchmeso.capture.plan import Step
 from torchmeso.capture.rig import Rig
-from torchmeso.capture.session import Moves, Step
+from torchmeso.capture.session import Moves
 from torchmeso.errors import ConfigError, RigError, StorageError
 
 
@@ -55,8 +56,8 @@ class Seeing:
 
 def small():
     poses = [Pose(turn, arc, 0) for turn in (0, 90) for arc in (20, 50)]
-    lamps = session.lamp_steps(poses, 2, (0.01, 0.1))
-    return lamps + session.sweep_steps((0, 90), ((20,), (50,)), (-2, 0, 2), 0.02, 0.5)
+    lamps = plan.lamp_steps(poses, 2, (0.01, 0.1))
+    return lamps + plan.sweep_steps((0, 90), ((20,), (50,)), (-2, 0, 2), 0.02, 0.5)
 
 
 def refused(text):
@@ -155,10 +156,10 @@ def test_an_order_moves_little():
     """A grid is gone through line by line there and back: no step longer than one of the grid."""
     grid = [Pose(30.0 * i, 15.0 * k, 0) for i in range(12) for k in range(5)]
     shuffled = random.Random(1).sample(grid, len(grid))
-    order = session.in_order(shuffled)
+    order = plan.in_order(shuffled)
     assert sorted(order) == grid
-    assert order == session.in_order(grid)
-    ways = [session.way(a, b) for a, b in itertools.pairwise(order)]
+    assert order == plan.in_order(grid)
+    ways = [plan.way(a, b) for a, b in itertools.pairwise(order)]
     shortest = 12 * 4 * 15.0 + 11 * 30.0
     assert sum(ways) <= 1.15 * shortest
 
@@ -166,7 +167,7 @@ def test_an_order_moves_little():
 def test_how_long_it_takes():
     steps = [Step(key="a", pose=Pose(60, 0, 0), exposures=(0.5, 1.5)), Step(key="b", pose=Pose(60, 0, 0), tilts=(0, 6))]
     steps.append(Step(key="p", pause="wait"))
-    took = session.seconds(steps, speed=60, settle=0.25, frame=0.1)
+    took = plan.seconds(steps, speed=60, settle=0.25, frame=0.1)
     assert took == pytest.approx((1 + 0.25 + 2 * 0.1 + 2.0) + (0.1 + 0.25 + 2 * 0.1 + 2 * 0.01))
 
 

@@ -8,29 +8,22 @@ Test: tests/capture/test_rig.py
 """
 
 import contextlib
-import fnmatch
 import math
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from types import TracebackType
 from typing import Literal
 
 import serial
-from serial.tools import list_ports
 
 from torchmeso.capture import dialects
-from torchmeso.capture.dialects import Dialect, Pose, Reply
+from torchmeso.capture.dialects import Dialect, Pose
+from torchmeso.capture.link import STUCK, Link, find_port
 from torchmeso.errors import ConfigError, RigError, check_range
 
 LOW, HIGH = Pose(-360.0, 0.0, -60.0), Pose(360.0, 180.0, 60.0)
 """Soft limits unless others are given, degrees."""
-
-KEPT = 64
-"""Numbered lines that are kept to be said again."""
-
-STUCK = 5.0
-"""Seconds after which a port that takes no bytes is given up."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,41 +64,13 @@ class RigOptions:
         check_range("rig.settle", self.settle, 0, 3600)
 
 
-def ports() -> list[tuple[str, str, str]]:
-    """Return the serial ports of this machine: name, what it is, serial number."""
-    return [(p.device, p.description or "", p.serial_number or "") for p in sorted(list_ports.comports())]
-
-
-def find_port(wanted: str) -> str:
-    """Return the name of the one port that `wanted` names: its name, a pattern, or a serial number.
-
-    Raises:
-        RigError: none does, or several do.
-    """
-    known = ports()
-    by_number = [name for name, _, number in known if number and number == wanted]
-    by_pattern = [name for name, _, _ in known if fnmatch.fnmatch(name, wanted)]
-    found = by_number or by_pattern
-    if len(found) > 1:
-        raise RigError(f"rig: expected one port, got {', '.join(found)} for {wanted}; name one of them")
-    if found:
-        return found[0]
-    if any(c in wanted for c in "*?[") or not wanted.startswith(("/", "COM")):
-        listed = ", ".join(name for name, _, _ in known) or "none"
-        raise RigError(f"rig: no port is {wanted}; ports of this machine: {listed}. Is the rig connected and on?")
-    return wanted
-
-
 @dataclass(eq=False, slots=True)
 class Rig:
     """An open line to a controller. Use it as a context: leaving it, however, switches everything off."""
 
     options: RigOptions
-    line: serial.Serial
+    link: Link
     speech: Dialect
-    number: int = 0
-    said: dict[int, str] = field(default_factory=dict)
-    came: bytearray = field(default_factory=bytearray)
     power: float = 0.0
 
     @classmethod
@@ -120,9 +85,10 @@ class Rig:
             line = serial.Serial(port, options.baud, timeout=0.01, write_timeout=STUCK)
         except (serial.SerialException, OSError, ValueError) as error:
             raise RigError(f"rig: {port} does not open ({error}); is it another program's?") from error
-        rig = cls(options, line, dialects.dialect(options.dialect))
+        speech = dialects.dialect(options.dialect)
+        rig = cls(options, Link(line, speech, options.answer, options.arrive, options.tries), speech)
         try:
-            rig._greet()
+            rig.link.greet()
         except BaseException:
             rig.stop()
             line.close()
@@ -144,7 +110,7 @@ class Rig:
         finally:
             if error is not None:
                 self.stop()
-            self.line.close()
+            self.link.close()
 
     def home(self) -> None:
         """Let the axes find their zeros.
@@ -237,10 +203,9 @@ class Rig:
         """End motion and switch everything off at once, as well as the line still allows; raises nothing."""
         with contextlib.suppress(Exception):
             self.power = 0.0
-            self.line.write(self.speech.reset)
-            self.line.flush()
+            self.link.write(self.speech.reset)
         with contextlib.suppress(Exception):
-            self._pause()
+            self.link.pause()
             for line in self.speech.unlock():
                 self._tell(line, self.options.answer)
         for lines in (self.speech.laser(0.0), *(self.speech.lamp(k, False) for k in range(self.options.lamps))):
@@ -261,7 +226,9 @@ class Rig:
             for _ in range(self.options.tries):
                 if self._obeyed(lines, self.options.answer) and done():
                     return
-            raise RigError(f"rig: {self.line.port} does not obey {lines[-1]}; is its cable sound, its firmware right?")
+            raise RigError(
+                f"rig: {self.link.port.port} does not obey {lines[-1]}; is its cable sound?"
+            )
 
     def _sound(self) -> bool:
         """Return whether the laser is as it was set, where the controller tells."""
@@ -272,7 +239,7 @@ class Rig:
         """Return where the axes stand and the laser's power: what two reports in a row agree on."""
         last = None
         for _ in range(4 * self.options.tries):
-            found = self._report()
+            found = self.link.report()
             told = (found.pose, found.laser) if found is not None and found.still and found.pose is not None else None
             if told is not None and told == last:
                 return told  # type: ignore[return-value]
@@ -282,7 +249,7 @@ class Rig:
     def _obeyed(self, lines: tuple[str, ...], seconds: float) -> bool:
         """Return whether each of `lines` was answered with ok; an alarm is unlocked for the next try."""
         for line in lines:
-            answer = self._once(line, seconds)
+            answer = self.link.say(line, seconds)
             if answer is None or answer.kind != "ok":
                 if answer is not None and answer.kind == "alarm":
                     self._unlock()
@@ -291,78 +258,27 @@ class Rig:
 
     def _tell(self, line: str, seconds: float) -> None:
         for _ in range(self.options.tries):
-            answer = self._once(line, seconds)
+            answer = self.link.say(line, seconds)
             if answer is not None and answer.kind == "ok":
                 return
             if answer is not None and answer.kind == "alarm":
                 self._unlock()
-        raise RigError(f"rig: {self.line.port} does not obey {line}; is its firmware {self.options.dialect}?")
+        raise RigError(f"rig: {self.link.port.port} does not obey {line}; is its firmware {self.options.dialect}?")
 
     def _unlock(self) -> None:
         """Let commands pass after an alarm, which the controller may have had from a damaged line."""
         if not self.speech.numbered:
-            self._write(b"\x18")
-            self._pause()
+            self.link.write(b"\x18")
+            self.link.pause()
             self.power = 0.0
         for line in self.speech.unlock():
-            self._once(line, self.options.answer)
-
-    def _once(self, line: str, seconds: float) -> Reply | None:
-        """Say a line once (numbered lines until they arrive), and return its answer: ok, error or alarm; else None."""
-        if self.speech.numbered:
-            return self._numbered(line, seconds)
-        self._report()  # what was said to earlier lines has come when the report has
-        self._drain()
-        self._write(line.encode() + b"\n")
-        return self._await(lambda r: r.kind in ("ok", "error", "alarm"), seconds)
-
-    def _numbered(self, line: str, seconds: float) -> Reply | None:
-        """Say a numbered line until it arrived once.
-
-        An ok has no number, and may be a late one to an earlier line: then that line is asked for by its number when
-        the next one comes, and is said again.
-        """
-        self.number += 1
-        self.said[self.number] = line
-        self.said.pop(self.number - KEPT, None)
-        at = self.number
-        for _ in range(2 * self.options.tries):
-            self._drain()
-            self._write(b"\n" + dialects.number_line(at, self.said[at]).encode() + b"\n")
-            answer = self._await(lambda r: r.kind in ("ok", "error", "resend", "report"), seconds)
-            if answer is None:  # the line or its answer is lost: the controller will say which
-                continue
-            if answer.kind == "report":  # its own ok must not be taken for that of the next line
-                self._await(lambda r: r.kind == "ok", 0.2)
-            if answer.kind in ("ok", "report"):
-                if at == self.number:
-                    return answer
-                at += 1
-                continue
-            again = self._await(lambda r: r.kind == "resend", 0.2) if answer.kind == "error" else answer
-            if again is not None and again.number == self.number + 1:
-                return Reply(kind="ok", text="it had arrived before")
-            if again is not None and again.number in self.said:
-                at = again.number
-            elif again is not None:
-                self._write(b"\n" + dialects.number_line(at - 1, f"M110 N{at - 1}").encode() + b"\n")
-                self._await(lambda r: r.kind == "ok", self.options.answer)
-        return None
-
-    def _report(self) -> Reply | None:
-        """Ask for a report; None where none comes undamaged."""
-        if self.speech.numbered:
-            found = self._numbered(self.speech.ask(), self.options.answer)
-            return found if found is not None and found.kind == "report" else None
-        self._drain()
-        self._write(self.speech.ask().encode())
-        return self._await(lambda r: r.pose is not None, self.options.answer / 4)
+            self.link.say(line, self.options.answer)
 
     def _arrive(self, pose: Pose, *, must: bool = True) -> bool:
         """Wait until the axes stand; return whether they stand at `pose`."""
         until = time.monotonic() + self.options.arrive
         while time.monotonic() < until:
-            found = self._report()
+            found = self.link.report()
             if found is not None and found.kind == "alarm":
                 self._unlock()
                 break
@@ -375,57 +291,6 @@ class Rig:
         if must:
             raise RigError(f"rig: expected it at {_told(pose)} within {self.options.arrive:g} s, it is not")
         return False
-
-    def _greet(self) -> None:
-        """Wait until somebody answers: the greeting may have been said before the port was open."""
-        for _ in range(self.options.tries):
-            if self.speech.numbered:
-                self._write(b"\n" + dialects.number_line(0, "M110 N0").encode() + b"\n")
-                if self._await(lambda r: r.kind == "ok", self.options.answer):
-                    return
-            elif self._report() is not None:
-                return
-        raise RigError(
-            f"rig: nobody answers at {self.line.port} in {self.options.dialect}; is it on, is this its port, "
-            f"are {self.options.baud} baud right?"
-        )
-
-    def _pause(self) -> None:
-        self._await(lambda r: r.kind == "started", 0.2)
-        self._drain()
-
-    def _drain(self) -> None:
-        """Forget what was said before."""
-        with self._vanishes():
-            self.line.read(self.line.in_waiting)
-        self.came.clear()
-
-    def _write(self, data: bytes) -> None:
-        with self._vanishes():
-            self.line.write(data)
-
-    def _await(self, wanted: Callable[[Reply], bool], seconds: float) -> Reply | None:
-        """Return the first line that is wanted, or None after so many seconds; busy controllers get more time."""
-        until = time.monotonic() + seconds
-        while time.monotonic() < until:
-            with self._vanishes():
-                self.came += self.line.read(max(self.line.in_waiting, 1))
-            while b"\n" in self.came:
-                line, _, rest = bytes(self.came).partition(b"\n")
-                self.came = bytearray(rest)
-                answer = self.speech.parse(line.decode("ascii", "replace"))
-                if answer.kind == "busy":
-                    until = max(until, time.monotonic() + self.options.arrive)
-                if wanted(answer):
-                    return answer
-        return None
-
-    @contextlib.contextmanager
-    def _vanishes(self) -> Iterator[None]:
-        try:
-            yield
-        except (serial.SerialException, OSError, TypeError) as error:
-            raise RigError(f"rig: the port {self.line.port} is gone ({error}); what was taken stays") from error
 
 
 def _told(pose: Pose) -> str:
