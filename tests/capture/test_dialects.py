@@ -49,6 +49,7 @@ def test_marlin_lines_and_answers():
     assert parse("Error:checksum mismatch, Last Line: 3").kind == "error"
     assert parse("echo:busy: processing").kind == "busy"
     assert parse("X:1.00 Y-2.50 Z:30.00 E:0").kind == "other"
+    assert parse("X:1.00 Y:-2.550 Z:30.00 E:0").kind == "other"
 
 
 def test_a_lost_byte_never_makes_a_numbered_line_good():

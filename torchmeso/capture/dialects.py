@@ -142,7 +142,7 @@ class Grbl:
         return Reply(kind="other", text=text)
 
 
-MARLIN_REPORT = re.compile(r"X:(-?\d+\.\d\d\d?) ?Y:(-?\d+\.\d\d\d?) ?Z:(-?\d+\.\d\d\d?)\b.*")
+MARLIN_REPORT = re.compile(r"X:(-?\d+\.\d\d) ?Y:(-?\d+\.\d\d) ?Z:(-?\d+\.\d\d)(?: .*)?")
 
 
 class Marlin:
