@@ -139,9 +139,7 @@ def undistort(seen: Float[Tensor, "*batch 2"], k: Float[Tensor, "5"]) -> Float[T
 def save(cameras: list[CalibratedCamera], path: str | Path) -> None:
     """Write `cameras` as JSON, whole or not at all."""
     fields = ("K", "distortion", "R", "t")
-    content = [
-        {**{f: getattr(c, f).tolist() for f in fields}, "width": c.width, "height": c.height} for c in cameras
-    ]
+    content = [{**{f: getattr(c, f).tolist() for f in fields}, "width": c.width, "height": c.height} for c in cameras]
     with replacing(path) as beside:
         beside.write_text(json.dumps({"kind": "cameras", "cameras": content}, indent=1) + "\n", encoding="utf-8")
 
