@@ -1,7 +1,7 @@
 """The command line: one thin function per job. Heavy imports stay inside the functions (torch costs 2 s).
 
 Results go to stdout, one line per product; progress and warnings to stderr. A MesoError becomes one sentence
-and exit status 2; a bug keeps its traceback. `compress` and `synthesize` have files of their own.
+and exit status 2; a bug keeps its traceback. `compress`, `synthesize`, `tile` and `rig` have files of their own.
 
 Test: tests/test_cli.py
 """
@@ -15,6 +15,7 @@ from typing import Any
 import click
 
 from torchmeso.backends.allocator import keep_freed_memory
+from torchmeso.cli_capture import rig
 from torchmeso.cli_compress import compress
 from torchmeso.cli_synthesize import synthesize, tile
 from torchmeso.console import progress as _progress
@@ -157,6 +158,7 @@ def _bake_one(meso: str, out: Any, force: bool, options: dict[str, Any]) -> None
 
 
 main.add_command(compress)
+main.add_command(rig)
 main.add_command(synthesize)
 main.add_command(tile)
 

@@ -100,12 +100,15 @@ def _values() -> dict[str, tuple[str, Float[Tensor, "light view H W 3"], float]]
     spread = torch.logspace(-3, 3, smooth.shape[3])[:, None]
     one = torch.zeros_like(smooth)
     one[7, 5, 2, 3] = 1e4
+    unlit = smooth.clone()
+    unlit[7], unlit[:, 5] = 0, 0
     return {
         "zero": ("all zero", torch.zeros_like(smooth), NEVER),
         "constant": ("one value everywhere", torch.full_like(smooth, 0.25), 0.5),
         "negative": ("negative values", -smooth, 0.5),
         "dynamic_range": ("texels of 1e6 : 1", smooth * spread, 0.5),
         "one_texel": ("one value of 1e4 among zeros", one, 1.01),
+        "zero_weights": ("a light and a view that show nothing, whose weights are zero", unlit, 0.5),
         "tiny": ("values of 1e-30", smooth * 1e-30, NEVER),
         "large": ("values of 1e4", smooth * 1e4, 0.5),
     }

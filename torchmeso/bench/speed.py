@@ -188,8 +188,8 @@ def compiled(context: Context) -> Iterator[Row]:
     """OpenCL beside the same frame through torch's compiler, which takes minutes to compile it."""
     row = Row(
         id="compiled.opencl_vs_torch", unit="x", better="higher", value=None,
-        what="curved silhouette, shadows, all outputs, 12k knot: opencl over torch.compile, which falls back to eager "
-        "torch for what it cannot compile",
+        what="curved silhouette, shadows, all outputs, 12k knot: opencl over torch with its hot arithmetic through "
+        "torch.compile",
     )  # fmt: skip
     if context.quick:
         yield replace(row, why="left out by --quick: compiling takes minutes")

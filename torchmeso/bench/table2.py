@@ -179,7 +179,7 @@ def _row(
 def brick(size: int) -> Float[Tensor, "light view H W 3"]:
     """Return the baked brick that is repeated in a table of `size` texels, in half precision."""
     options = BtfOptions(texels=min(size // 2, MOST_BAKED), lights="ubo81", views="ubo81", samples=1, bounces=0)
-    return bake_btf.in_memory(generators.brick(), options).pictures().half()
+    return bake_btf.in_memory(generators.brick(), options, torch.float16).pictures()
 
 
 def codes_of(base: Tensor, size: int, view: int, noise: Tensor) -> UInt8[Tensor, "light H W 3"]:

@@ -26,6 +26,9 @@ from torchmeso.errors import ShapeError, check_finite, check_range, check_shape
 from torchmeso.geometry import sphere
 from torchmeso.geometry.sphere import SphereGrid
 
+MISS = -1
+"""In place of a distance: nothing is met."""
+
 ROUNDED = 1e-3
 """Halves of the longest distance may lie above it by this share."""
 
@@ -117,7 +120,7 @@ class Gdm:
     def samples(
         self, voxel: Int[Tensor, "*batch 8"], node: Int[Tensor, "*batch 4"], dtype: torch.dtype
     ) -> tuple[Float[Tensor, "*batch 8 4"], Float[Tensor, "*batch 8 4"]]:
-        """Return the distances in the table, tile units, and 1 where they are of a hit.
+        """Return the distances in the table, tile units (negative: of no hit), and 1 where they are of a hit.
 
         Args:
             voxel: (layer * H + row) * W + column.
@@ -126,10 +129,11 @@ class Gdm:
         """
         rows = self._rows
         index = voxel[..., :, None] * rows.distance.shape[1] + node[..., None, :]
-        found = rows.distance.flatten()[index].to(dtype)
+        found = rows.distance.flatten().take(index).to(dtype)
+        met = (found >= 0).to(dtype)
         if self.distance.dtype == torch.uint8:
             found = found * (self.cap / 255)
-        return found, 1 - rows.left.flatten()[index].to(dtype)
+        return found, met
 
     @property
     def solid(self) -> Float[Tensor, "voxel"]:
@@ -172,14 +176,15 @@ class Gdm:
         left = sphere.with_poles(met) < 0.5
         # A pole's distance is the mean of those around it that meet something.
         total = sphere.with_poles(self.distance.to(exact) * met) / sphere.with_poles(met).clamp(min=1e-6)
-        distance = total.round().to(torch.uint8) if self.distance.dtype == torch.uint8 else total
+        distance = torch.where(
+            left, MISS, total.round().to(torch.int16) if self.distance.dtype == torch.uint8 else total
+        )
         solid = (self.occupancy > 0.5).to(torch.float32)
-        return _Rows(distance.reshape(n, -1), left.reshape(n, -1), solid.reshape(n))
+        return _Rows(distance.reshape(n, -1), solid.reshape(n))
 
 
 class _Rows(NamedTuple):
-    distance: Tensor
-    left: Tensor
+    distance: Tensor  # MISS where nothing is met
     solid: Tensor
 
 

@@ -22,6 +22,9 @@ LEVEL = 1e-12
 APART = 4.0
 """Voxels between distances that are not of one surface."""
 
+BLOCK = 1 << 12
+"""Rays that are asked for together: their samples stay in the cache."""
+
 
 class Query(NamedTuple):
     """What a ray meets.
@@ -84,12 +87,20 @@ class Sampled(Slab, Protocol):
     def samples(
         self, voxel: Int[Tensor, "*batch 8"], node: Int[Tensor, "*batch 4"], dtype: torch.dtype
     ) -> tuple[Float[Tensor, "*batch 8 4"], Float[Tensor, "*batch 8 4"]]:
-        """Return distances in tile units, and 1 where they are of a hit."""
+        """Return distances in tile units, any number where they are of no hit, and 1 where they are of one."""
         ...
 
 
 def query(table: Sampled, place: Float[Tensor, "*batch 3"], w: Float[Tensor, "*batch 3"]) -> Query:
     """Return how far it is from `place` along `w` to material; see `Gdm.evaluate`."""
+    rays = place.reshape(-1, 3)
+    if len(rays) <= BLOCK:
+        return _query(table, place, w)
+    parts = [_query(table, *part) for part in zip(rays.split(BLOCK), w.reshape(-1, 3).split(BLOCK), strict=True)]
+    return Query(*(torch.cat(x).reshape(place.shape[:-1]) for x in zip(*parts, strict=True)))
+
+
+def _query(table: Sampled, place: Tensor, w: Tensor) -> Query:
     voxel, weight, away = corners(table, place)
     toward = table.directions.interpolate(w)
     solid = table.solid[voxel]

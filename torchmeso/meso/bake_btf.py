@@ -96,12 +96,14 @@ def bake(
         writer.finish()
 
 
-def in_memory(meso: Mesostructure, options: BtfOptions) -> Btf:
-    """Return the baked BTF in float32 without writing a file."""
+def in_memory(meso: Mesostructure, options: BtfOptions, dtype: torch.dtype = torch.float32) -> Btf:
+    """Return the baked BTF without writing a file."""
     lights, views = hemisphere.parse(options.lights), hemisphere.parse(options.views)
     tracer = TileTracer(meso.geometry, meso.h)
-    columns = [view_column(tracer, view, options) for view in range(len(views))]
-    return Btf(images=torch.stack(columns, 1), lights=lights, views=views, h=meso.h)
+    images = torch.empty(len(lights), len(views), options.texels, options.texels, 3, dtype=dtype)
+    for view in range(len(views)):
+        images[:, view] = view_column(tracer, view, options)
+    return Btf(images=images, lights=lights, views=views, h=meso.h)
 
 
 def view_column(tracer: TileTracer, view: int, options: BtfOptions) -> Float[Tensor, "light H W 3"]:

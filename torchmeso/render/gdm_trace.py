@@ -10,7 +10,7 @@ inside of material. Such a ray met it in the prism before, where the minority to
 Test: tests/render/test_gdm_trace.py
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 import torch
@@ -18,14 +18,12 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchmeso.data.gdm import Gdm
-from torchmeso.geometry.frames import around
-from torchmeso.geometry.shell import BOTTOM, OUTWARD, Shell, left_of
+from torchmeso.geometry import shell_walk
+from torchmeso.geometry.shell import BOTTOM, Shell
+from torchmeso.geometry.shell_walk import Tetrahedra
 
 MOST_STEPS = 4096
 """Tetrahedra that a ray may pass."""
-
-NUDGES = (1e-9, 1e-7, 1e-5, 1e-3, 0.0)
-"""A ray beside the face it comes in by is moved by these shares of the way to its middle, one after the other."""
 
 TIE = 1e-6
 """Tile units: material that lies at the very end of a way is met."""
@@ -33,8 +31,8 @@ TIE = 1e-6
 SHORT = 1e-5
 """Ways in texture space, tile units, that rounding makes or leaves out: past an edge or a corner."""
 
-INTO = OUTWARD.flip(1)
-"""Corners of the face a ray came in through, counter-clockwise seen by the ray."""
+BLOCK = 1 << 15
+"""Rays that are followed together: their columns stay in the cache."""
 
 
 class Entries(NamedTuple):
@@ -53,6 +51,12 @@ class Entries(NamedTuple):
     tet: Int[Tensor, "n"]
     corner: Int[Tensor, "n"]
     place: Float[Tensor, "n 3"] | None = None
+
+    def part(self, first: int, count: int) -> "Entries":
+        """Return `count` rays from `first` on."""
+        own = slice(first, first + count)
+        place = None if self.place is None else self.place[own]
+        return Entries(self.origin[own], self.direction[own], self.tet[own], self.corner[own], place)
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -91,65 +95,79 @@ def trace(shell: Shell, gdm: Gdm | None, entries: Entries, *, queries: int = 1, 
     Returns:
         what they met, in the order of the rays.
     """
+    through = shell_walk.prepare(shell)
+    parts = [
+        _trace(through, gdm, entries.part(at, BLOCK), queries, floor)
+        for at in range(0, max(len(entries.tet), 1), BLOCK)
+    ]
+    if len(parts) == 1:
+        return parts[0]
+    names = [f.name for f in fields(Traced)]
+    return Traced(**{name: torch.cat([getattr(part, name) for part in parts]) for name in names})
+
+
+def _trace(through: Tetrahedra, gdm: Gdm | None, entries: Entries, queries: int, floor: bool) -> Traced:
     n = len(entries.tet)
-    axes = around(entries.direction.double())
-    rays = _Rays(entries.origin.double(), torch.stack([axes.t, axes.b, axes.n], 1))
-    tet, corner = entries.tet.clone(), entries.corner.clone()
-    within = corner < 0
-    corner[within] = _behind(shell, _Rays(rays.origin[within], rays.axes[within]), tet[within])
-    rays, enters = _into_face(shell, rays, tet, corner)
-    share = _shares(shell, rays, tet, corner)
-    start_t, start = share.t.clone(), share.place.clone()
+    rays, face, enters = shell_walk.enter(through, *entries[:4])
+    share = face.shares()
+    start, start_t = through.place(entries.tet, face, share), (share * face.t).sum(0)
+    t, place = start_t.clone(), start.clone()
+    within = entries.corner < 0
     if entries.place is not None:
         start_t[within], start[within] = 0, entries.place[within].double()
-    hit, t = torch.zeros(n, dtype=torch.bool), share.t.clone()
-    place, direction = share.place.clone(), torch.zeros(n, 3, dtype=torch.float64)
-    prism, through, prisms = tet // 3, torch.zeros(n, dtype=torch.long), torch.zeros(n, dtype=torch.long)
+    hit, direction = torch.zeros(n, dtype=torch.bool), torch.zeros(n, 3, dtype=torch.float64)
+    prism, passed_by, prisms = entries.tet // 3, torch.zeros(n, dtype=torch.long), torch.zeros(n, dtype=torch.long)
     overlooked = _Overlooked(torch.full((n,), torch.inf, dtype=torch.float64), place.clone(), prism.clone())
-    active = enters.nonzero()[:, 0]
-    through[~enters] = shell.neighbour[tet, corner][~enters]
+    shut = (~enters).nonzero()[:, 0]
+    passed_by[shut] = through.neighbour[4 * entries.tet[shut] + (6 - face.corner[:, shut].sum(0))]
+    # Columns of the rays that are on their way: `ray` is their number in the lists above.
+    ray = enters.nonzero()[:, 0]
+    rays, face, tet = rays.select(ray), face.select(ray), entries.tet[ray]
     for _ in range(MOST_STEPS):
-        if not len(active):
+        if not len(ray):
             break
-        own = _Rays(rays.origin[active], rays.axes[active])
-        out = _leave(shell, own, tet[active], corner[active])
-        ahead = shell.neighbour[tet[active], out]
-        at = _shares(shell, own, tet[active], out)
-        leaves = (ahead < 0) | (ahead // 3 != prism[active])
-        ray, now = active[leaves], leaves.nonzero()[:, 0]
-        way = at.place[now] - start[ray]
+        out, face = shell_walk.leave(through, rays, tet, face)
+        ahead = through.neighbour[4 * tet + out]
+        now = ((ahead < 0) | (ahead // 3 != tet // 3)).nonzero()[:, 0]
+        own, at_face, before = ray[now], face.select(now), tet[now]
+        share = at_face.shares()
+        at_t, at_place = (share * at_face.t).sum(0), through.place(before, at_face, share)
+        way = at_place - start[own]
         length = way.norm(dim=-1)
         v = way / length.clamp(min=1e-30)[:, None]
-        prisms[ray] += length > SHORT
-        direction[ray] = torch.where(length[:, None] > 0, v, direction[ray])
-        met, d, near, sunk = _meet(gdm, start[ray], v, length, queries)
-        per_length = (at.t[now] - start_t[ray]) / length.clamp(min=1e-30)
-        t[ray] = torch.where(met, start_t[ray] + d * per_length, at.t[now])
-        place[ray] = torch.where(met[:, None], start[ray] + d[:, None] * v, at.place[now])
-        hit[ray] = met
-        before = ray[sunk & overlooked.t[ray].isfinite()]
-        t[before], place[before], prism[before] = (x[before] for x in overlooked)
-        passed = torch.where(near <= length, start_t[ray] + near.clamp(max=1e30) * per_length, torch.inf)
-        overlooked.t[ray], overlooked.prism[ray] = passed, prism[ray]
-        overlooked.place[ray] = start[ray] + torch.where(near <= length, near, 0)[:, None] * v
+        prisms[own] += length > SHORT
+        direction[own] = torch.where(length[:, None] > 0, v, direction[own])
+        met, d, near, sunk = _meet(gdm, start[own], v, length, queries)
+        per_length = (at_t - start_t[own]) / length.clamp(min=1e-30)
         gone = ~met & (ahead[now] < 0)
-        through[ray[gone]] = ahead[now][gone]
-        done = torch.zeros(len(active), dtype=torch.bool)
-        done[now] = met | gone
+        goes = ~(met | gone)
+        ends = (~goes).nonzero()[:, 0]
+        last = own[ends]
+        hit[last], prism[last] = met[ends], before[ends] // 3
+        passed_by[last] = torch.where(met[ends], 0, ahead[now][ends])
+        t[last] = torch.where(met, start_t[own] + d * per_length, at_t)[ends]
+        place[last] = torch.where(met[:, None], start[own] + d[:, None] * v, at_place)[ends]
+        earlier = own[sunk & overlooked.t[own].isfinite()]
+        t[earlier], place[earlier], prism[earlier] = (x[earlier] for x in overlooked)
         # The others go on, in texture coordinates of the prism they come into.
-        goes = (~done).nonzero()[:, 0]
-        onward, following = active[goes], ahead[goes]
-        corner[onward] = _facing(shell, following, tet[onward])
-        tet[onward] = following
-        crossing = leaves[goes]
-        fresh = onward[crossing]
-        entered = _shares(shell, _Rays(rays.origin[fresh], rays.axes[fresh]), tet[fresh], corner[fresh])
-        start[fresh], start_t[fresh] = entered.place, entered.t
-        prism[fresh] = tet[fresh] // 3
-        active = onward
+        onward, within = own[goes], (near <= length)[goes]
+        passing = torch.where(within, near[goes], 0)
+        overlooked.t[onward] = torch.where(within, start_t[onward] + passing * per_length[goes], torch.inf)
+        overlooked.place[onward] = start[onward] + passing[:, None] * v[goes]
+        overlooked.prism[onward] = before[goes] // 3
+        behind = shell_walk.go_on(through, tet, out, face)
+        following = ahead[now][goes]
+        start[onward] = through.place(following, behind.select(now[goes]), share[:, goes])
+        start_t[onward] = at_t[goes]
+        face, tet = behind, ahead
+        if not goes.all():
+            stays = torch.ones(len(ray), dtype=torch.bool)
+            stays[now] = goes
+            left = stays.nonzero()[:, 0]
+            ray, tet, rays, face = ray[left], tet[left], rays.select(left), face.select(left)
     if floor:
-        hit |= through == BOTTOM
-    return Traced(hit=hit, t=t, place=place, direction=direction, prism=prism, through=through, prisms=prisms)
+        hit |= passed_by == BOTTOM
+    return Traced(hit=hit, t=t, place=place, direction=direction, prism=prism, through=passed_by, prisms=prisms)
 
 
 class _Overlooked(NamedTuple):
@@ -158,92 +176,6 @@ class _Overlooked(NamedTuple):
     t: Tensor
     place: Tensor
     prism: Tensor
-
-
-class _Rays(NamedTuple):
-    origin: Tensor  # (n, 3)
-    axes: Tensor  # (n, 3, 3): two across the ray, and the ray
-
-
-class _Share(NamedTuple):
-    t: Tensor  # (n,)
-    place: Tensor  # (n, 3)
-
-
-def _seen(shell: Shell, rays: _Rays, vertex: Tensor) -> Tensor:
-    """Return vertices (n, k) as seen along rays: across, up, and how far along."""
-    way = shell.vertices[vertex] - rays.origin[:, None]
-    return (rays.axes[:, None] * way[:, :, None]).sum(-1)
-
-
-def _into_face(shell: Shell, rays: _Rays, tet: Tensor, corner: Tensor) -> tuple[_Rays, Bool[Tensor, "n"]]:
-    """Return rays moved into the faces they come in by, and which come in: a face seen on edge lets none in.
-
-    What says by which face a ray comes in rounds otherwise than what is seen along it; a walk that begins beside its
-    face would not find out. The ways are of the order of rounding, and longer only as long as they do not suffice.
-    """
-    vertex = shell.tets[tet].gather(1, INTO[corner])
-    origin, enters = rays.origin.clone(), torch.zeros(len(tet), dtype=torch.bool)
-    active = torch.arange(len(tet))
-    for step in NUDGES:
-        own = _Rays(origin[active], rays.axes[active])
-        p = _seen(shell, own, vertex[active])[..., :2]
-        ids = vertex[active]
-        within = left_of(p, p.roll(-1, 1), ids, ids.roll(-1, 1)).all(1)
-        enters[active[within]] = True
-        active, p = active[~within], p[~within]
-        if not len(active):
-            break
-        way = p.mean(1) * step
-        origin[active] += (way[:, :, None] * rays.axes[active, :2]).sum(1)
-    return _Rays(origin, rays.axes), enters
-
-
-def _behind(shell: Shell, rays: _Rays, tet: Tensor) -> Tensor:
-    """Return the corner of `tet` opposite the face by which rays would have come in that begin inside of it."""
-    found = torch.zeros_like(tet)
-    for corner in range(4):
-        vertex = shell.tets[tet][:, INTO[corner]]
-        p = _seen(shell, rays, vertex)[..., :2]
-        inside = left_of(p, p.roll(-1, 1), vertex, vertex.roll(-1, 1)).all(1)
-        found[inside] = corner
-    return found
-
-
-def _shares(shell: Shell, rays: _Rays, tet: Tensor, corner: Tensor) -> _Share:
-    """Return where rays pass the face of a tetrahedron opposite `corner`."""
-    local = OUTWARD[corner]
-    vertex = shell.tets[tet].gather(1, local)
-    p = _seen(shell, rays, vertex)
-    x, y = p[..., 0], p[..., 1]
-    following, last = [1, 2, 0], [2, 0, 1]
-    area = x[:, following] * y[:, last] - y[:, following] * x[:, last]
-    total = area.sum(1, keepdim=True)
-    # A face seen on edge has no inside: its middle is as good as any place.
-    flat = total.abs() < 1e-30
-    weight = torch.where(flat, 1 / 3, area / torch.where(flat, 1, total)).clamp(0, 1)
-    weight = weight / weight.sum(1, keepdim=True)
-    uvz = shell.uvz[tet].gather(1, local[..., None].expand(-1, -1, 3))
-    return _Share((weight * p[..., 2]).sum(1), (weight[..., None] * uvz).sum(1))
-
-
-def _leave(shell: Shell, rays: _Rays, tet: Tensor, corner: Tensor) -> Tensor:
-    """Return the corner opposite the face that rays leave a tetrahedron through, given the one they came in by."""
-    base = INTO[corner]
-    vertex = shell.tets[tet]
-    tip = vertex.gather(1, corner[:, None])
-    rim = vertex.gather(1, base)
-    p, q = _seen(shell, rays, tip)[..., :2], _seen(shell, rays, rim)[..., :2]
-    left = left_of(p.expand_as(q), q, tip.expand_as(rim), rim)
-    between = left & ~left.roll(-1, 1)  # the ray passes between this corner of the rim and the next, seen from the tip
-    # All on one side: the ray meets the tip itself, and any way out is as good as another.
-    which = torch.where(between.any(1), between.int().argmax(1), 0)
-    return base.gather(1, ((which + 2) % 3)[:, None])[:, 0]
-
-
-def _facing(shell: Shell, tet: Tensor, before: Tensor) -> Tensor:
-    """Return the corner of `tet` whose face lies towards its neighbour `before`."""
-    return (shell.neighbour[tet] == before[:, None]).int().argmax(1)
 
 
 def _meet(

@@ -1,0 +1,1 @@
+"""From a rig's frames to BTF and MDF: calibration, rectification, laser lines, space-time analysis, merge."""
