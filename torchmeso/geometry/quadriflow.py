@@ -6,10 +6,12 @@ are large; split into smaller ones they are laid back onto the mesh (`onto`).
 Test: tests/geometry/test_quadriflow.py
 """
 
+from typing import Any
+
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor
 from trimesh.triangles import closest_point
 
@@ -44,7 +46,7 @@ def quads_of(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], count: i
     low, high = vertices.aminmax(dim=0)
     size = float((high - low).max())
     try:
-        found = pyquadriflow(
+        found: Any = pyquadriflow(
             count, SEED, ((vertices - low) / size).tolist(), faces.tolist(), False, False, False, False, False
         )
     except Exception as error:  # the package raises no kind of its own
@@ -57,7 +59,7 @@ def onto(patches: Patches, vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F
     """Return patches whose points are moved to the nearest of a mesh, among the triangles whose middles are near."""
     triangles = vertices[faces].double().numpy()
     points = patches.vertices.numpy()
-    _, near = cKDTree(triangles.mean(1)).query(points, k=min(NEAR, len(triangles)))
+    _, near = KDTree(triangles.mean(1)).query(points, k=min(NEAR, len(triangles)))
     near = near.reshape(len(points), -1)
     found = closest_point(triangles[near.ravel()], points.repeat(near.shape[1], 0)).reshape(*near.shape, 3)
     best = np.square(found - points[:, None]).sum(-1).argmin(1)
