@@ -226,9 +226,7 @@ class Rig:
             for _ in range(self.options.tries):
                 if self._obeyed(lines, self.options.answer) and done():
                     return
-            raise RigError(
-                f"rig: {self.link.port.port} does not obey {lines[-1]}; is its cable sound?"
-            )
+            raise RigError(f"rig: {self.link.port.port} does not obey {lines[-1]}; is its cable sound?")
 
     def _sound(self) -> bool:
         """Return whether the laser is as it was set, where the controller tells."""
