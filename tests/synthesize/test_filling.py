@@ -3,7 +3,17 @@ import torch
 
 from tests.synthesize import looks
 from torchmeso.synthesize import patch_error
-from torchmeso.synthesize.filling import Filler, _cramped, _emptiest, _sides, box_sums, place, seam_costs, seam_errors
+from torchmeso.synthesize.filling import (
+    Filler,
+    Parts,
+    _cramped,
+    _emptiest,
+    _sides,
+    box_sums,
+    place,
+    seam_costs,
+    seam_errors,
+)
 from torchmeso.synthesize.patch_error import Search
 from torchmeso.synthesize.seam_graphcut import FREE, NEW, OLD, STEPS
 
@@ -15,7 +25,8 @@ def source(rng):
 
 def filler(source, rng, backend="torch", **more):
     dials = {"patch": 8, "candidates": 4, "refine": 6, "calm": 0} | more
-    return Filler(search=Search(source), rng=rng, backend=backend, **dials)
+    search = Search(source)
+    return Filler(search=search, parts=Parts(search, dials["patch"]), rng=rng, backend=backend, **dials)
 
 
 def with_frame(source, side=16, band=3):
@@ -131,3 +142,24 @@ def test_windows_leave_room_for_cuts():
 def test_box_sums_are_sums_over_windows(rng):
     x = torch.randint(0, 9, (5, 7), generator=rng)
     assert box_sums(x, 3).equal(x.unfold(0, 3, 1).unfold(1, 3, 1).sum((-1, -2)))
+
+
+@pytest.mark.parametrize("size", [(60, 47), (60, 9)])
+def test_a_large_exemplar_is_searched_in_parts_that_hold_every_placement(size, rng):
+    source, patch = patch_error.exemplar(looks.noise(*size, rng)), 8
+    whole = Search(source)
+    parts = Parts(whole, patch)
+    target, mask = source.codes[:patch, :patch], torch.ones(patch, patch, dtype=torch.bool)
+    errors, seen = whole.errors(target, mask), torch.zeros(whole.placements(patch, patch), dtype=torch.bool)
+    for _ in range(200):
+        row, column, search = parts.draw(rng)
+        found = search.errors(target, mask)
+        at = slice(row, row + found.shape[0]), slice(column, column + found.shape[1])
+        assert found.equal(errors[at]) and found.numel() < errors.numel()
+        seen[at] = True
+    assert seen.all()
+
+
+def test_a_small_exemplar_is_one_part(rng):
+    whole = Search(patch_error.exemplar(looks.noise(40, 39, rng)), toroidal=True)
+    assert Parts(whole, 8).draw(rng) == (0, 0, whole)

@@ -14,7 +14,8 @@ side. All numbers are whole, and choices are drawn from `rng`: the same seed fil
 Test: tests/synthesize/test_filling.py
 """
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
@@ -37,12 +38,55 @@ POOL = 4
 """Candidates are drawn from so many times as many of the best placements."""
 
 
+PART = 2.5
+"""Sides of a patch along a part of a large exemplar, see `Parts`."""
+
+
+class Parts:
+    """A large exemplar as squares that are searched one at a time, drawn at random.
+
+    A search transforms all of what it looks at; a patch needs a choice of placements, not all of them. An exemplar of
+    up to twice `PART` patches along a side is one part. Neighbours overlap by a patch, so that each placement lies in
+    some part, but those over the border of a toroidal one.
+    """
+
+    def __init__(self, whole: Search, patch: int):
+        """Divide what `whole` searches into parts for patches of this side."""
+        self._whole, self._searches = whole, dict[tuple[int, int], Search]()
+        side = math.ceil(PART * patch)
+        self._starts: list[tuple[int, int]] = []
+        if max(whole.source.texels) > 2 * side:
+            rows, columns = (_starts(n, side, patch) for n in whole.source.texels)
+            self._starts = [(row, column) for row in rows for column in columns]
+        self._side = side
+
+    def draw(self, rng: torch.Generator) -> tuple[int, int, Search]:
+        """Return first row and column of a part, and its search."""
+        if not self._starts:
+            return 0, 0, self._whole
+        row, column = self._starts[int(torch.randint(len(self._starts), (1,), generator=rng))]
+        if (row, column) not in self._searches:
+            rows, columns = (slice(first, first + self._side) for first in (row, column))
+            source = self._whole.source
+            part = replace(source, codes=source.codes[rows, columns], power=source.power[rows, columns])
+            self._searches[row, column] = Search(part)
+        return row, column, self._searches[row, column]
+
+
+def _starts(size: int, side: int, overlap: int) -> list[int]:
+    """Return where parts of a side begin that overlap by at least so much; the whole where it is shorter."""
+    last = max(size - side, 0)
+    count = math.ceil(last / max(side - overlap, 1))
+    return [last * k // max(count, 1) for k in range(count + 1)]
+
+
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Filler:
     """What areas are filled from, and how.
 
     Attributes:
         search: the exemplar's spectra; whether it is toroidal.
+        parts: what candidates are searched in, of a large exemplar.
         patch: side of a patch in texels.
         candidates: placements that are cut, of which the cheapest is laid.
         refine: most further patches over the worst seams of an area.
@@ -52,6 +96,7 @@ class Filler:
     """
 
     search: Search
+    parts: Parts
     patch: int
     candidates: int
     refine: int
@@ -107,12 +152,13 @@ class Filler:
     def _candidates(self, placed: Tensor, there: Tensor, window: Tensor) -> Int[Tensor, "n side side"]:
         """Return patches drawn from the best over the overlap, but not what lies there already."""
         side = len(window)
-        errors = self.search.errors(placed, there).flatten()
+        row, column, search = self.parts.draw(self.rng)
+        errors = search.errors(placed, there).flatten()
         n = min(self.candidates, len(errors))
         pool = errors.topk(min(POOL * n, len(errors)), largest=False, sorted=False).indices.sort().values
         drawn = pool[torch.randperm(len(pool), generator=self.rng)[:n]]
-        columns = self.search.placements(side, side).columns
-        return place(self.search.source, drawn // columns, drawn % columns, side, side)
+        columns = search.placements(side, side).columns
+        return place(self.search.source, row + drawn // columns, column + drawn % columns, side, side)
 
 
 def _continued(e: Int[Tensor, "n side side"], there: Bool[Tensor, "side side"]) -> Int[Tensor, "n side side"]:

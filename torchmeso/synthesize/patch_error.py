@@ -19,7 +19,7 @@ Test: tests/synthesize/test_patch_error.py
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -42,6 +42,9 @@ MIDDLE = 2048
 
 FLOOR = 1e-7
 """Share of the largest direction of a metric below which a direction is left out."""
+
+BLOCK = 1 << 16
+"""Texels whose channels are taken at a time."""
 
 Look = EigenBtf | ShBtf | ShPcaBtf | Tensor
 """What patches can be cut from: a BTF model, or a picture (H, W, C)."""
@@ -133,9 +136,11 @@ def _of_double_sh(model: ShBtf, metric: Metric) -> Tensor:
     light = _light_factor(model.lights, model.terms[0], metric)[:n_light]
     Y = held_basis(model.views, model.views.directions(torch.float64), model.terms[1])[:, :n_view]
     view = _factor(Y.mT @ (_shares(model.views, metric.alpha)[:, None] * Y))
-    C = model.truncated(n_light, n_view).decoded()
-    found = torch.einsum("ijhwc,ia,jb->hwabc", C, light.to(C.dtype), view.to(C.dtype))
-    return found.flatten(2).float()
+    model = model.truncated(n_light, n_view)
+    rows = max(BLOCK // model.texels[1], 1)
+    parts = (replace(model, maps=maps).decoded() for maps in model.maps.split(rows, 2))
+    each = [torch.einsum("ijhwc,ia,jb->hwabc", C, light.to(C.dtype), view.to(C.dtype)).flatten(2) for C in parts]
+    return torch.cat(each).float()
 
 
 def _of_eigen(model: EigenBtf, metric: Metric) -> Tensor:
@@ -208,11 +213,16 @@ def exemplar(look: Look, metric: Metric | None = None, *, channels_kept: int = 2
 def _quantised(found: Float[Tensor, "H W C"], most: int, energy: float) -> Exemplar:
     height, width, n = found.shape
     rows = found.flatten(0, 1)
-    square = rows.square().sum(-1, dtype=torch.float64)
-    rows = (rows.double() - rows.mean(0, dtype=torch.float64)).float()
-    whole = float(rows.square().sum(dtype=torch.float64))
+    # By blocks: never a second copy of what may be gigabytes.
+    mean = torch.stack([block.sum(0, dtype=torch.float64) for block in rows.split(BLOCK)]).sum(0) / len(rows)
+
+    def blocks() -> Iterator[Tensor]:
+        return ((block.double() - mean).float()[None] for block in rows.split(BLOCK))
+
+    square = torch.cat([block.square().sum(-1, dtype=torch.float64) for block in rows.split(BLOCK)])
+    whole = float(sum(block.square().sum(dtype=torch.float64) for block in blocks()))
     rank = min(most, n, len(rows))
-    (scores,), _ = subspace.factor(lambda: [rows[None]], len(rows), n, 1, rank)
+    (scores,), _ = subspace.factor(blocks, len(rows), n, 1, rank)
     each = scores.square().sum(0, dtype=torch.float64)
     # Not fewer than what the energy asks for: the first axes whose sum reaches it.
     count = min(int((each.cumsum(0) < energy * whole).sum()) + 1, rank)

@@ -19,6 +19,7 @@ boykov2004experimental's two trees. In torch SciPy's maximum flow takes the plac
 Kernel: kernels_cl/synthesize/seam_graphcut.cl          Test: tests/synthesize/test_seam_graphcut.py
 """
 
+from functools import lru_cache
 from typing import NamedTuple, cast
 
 import numpy as np
@@ -98,8 +99,9 @@ def cut(
 def _check_whole(name: str, x: Tensor, most: int) -> None:
     if x.dtype.is_floating_point:
         raise ShapeError(f"{name}: expected whole numbers, got {x.dtype}")
-    if x.numel() and (int(x.min()) < 0 or int(x.max()) > most):
-        raise ShapeError(f"{name}: expected numbers from 0 to {most}, got {int(x.min())} to {int(x.max())}")
+    low, high = (int(end) for end in x.aminmax()) if x.numel() else (0, 0)
+    if low < 0 or high > most:
+        raise ShapeError(f"{name}: expected numbers from 0 to {most}, got {low} to {high}")
 
 
 def gaps(side: Int[Tensor, "H W"]) -> tuple[int, int] | None:
@@ -108,8 +110,14 @@ def gaps(side: Int[Tensor, "H W"]) -> tuple[int, int] | None:
     Corners are numbered row by row, (H + 1) x (W + 1) of them. The first follows what is old, going clockwise around
     the border. Both sides have to reach the border, all pieces of each, and there one after the other.
     """
-    held = side.numpy()
-    height, width = held.shape
+    held = side.to(torch.uint8).contiguous().numpy()
+    return _gaps(held.tobytes(), *held.shape)
+
+
+@lru_cache(maxsize=256)
+def _gaps(held_bytes: bytes, height: int, width: int) -> tuple[int, int] | None:
+    """Return the same; overlaps of a grid of patches come again and again, and looking costs more than a small cut."""
+    held = np.frombuffer(held_bytes, np.uint8).reshape(height, width)
     border = np.concatenate([held[0], held[:, -1], held[-1, ::-1], held[::-1, 0]])
     terminal = np.flatnonzero((border == OLD) | (border == NEW))
     before, after = border[terminal], np.roll(border[terminal], -1)

@@ -35,7 +35,7 @@ from torchmeso.data import tile_set
 from torchmeso.data.tile_set import Marks, TileSet
 from torchmeso.errors import ConfigError, check_range
 from torchmeso.synthesize import seam_graphcut
-from torchmeso.synthesize.filling import Filler, place, seam_errors
+from torchmeso.synthesize.filling import Filler, Parts, place, seam_errors
 from torchmeso.synthesize.patch_error import Exemplar, Search, one_thread
 from torchmeso.synthesize.seam_graphcut import FREE, NEW, OLD, Cut, differences
 
@@ -188,8 +188,8 @@ def grow(
     with one_thread():
         search = Search(source, toroidal=options.toroidal)
         filler = Filler(
-            search=search, patch=patch, candidates=options.candidates, refine=options.refine,
-            calm=_calm(source), rng=rng, backend=chosen,
+            search=search, parts=Parts(search, patch), patch=patch, candidates=options.candidates,
+            refine=options.refine, calm=_calm(source), rng=rng, backend=chosen,
         )  # fmt: skip
         if corners is None:
             corners = _corners(search, band, wanted.samples, rng, chosen)
