@@ -1,14 +1,13 @@
 """A rig over a real pty, with a process that is the controller."""
 
+import os
 import random
 import time
 from dataclasses import replace
 
 import pytest
-import serial
 
 from torchmeso.capture import link, virtual
-from torchmeso.capture import rig as rigs
 from torchmeso.capture.dialects import Pose
 from torchmeso.capture.rig import Rig, RigOptions
 from torchmeso.capture.virtual import VirtualOptions
@@ -83,10 +82,16 @@ def test_a_port_that_vanishes_is_said():
     rig_of.link.close()
 
 
-def test_a_port_where_nobody_answers(monkeypatch):
-    monkeypatch.setattr(rigs.serial, "Serial", lambda *a, **k: serial.serial_for_url("loop://", timeout=0.01))
-    with pytest.raises(RigError, match=r"nobody answers at .* in grbl"):
-        Rig.open(RigOptions(port="/dev/null0", answer=0.02, tries=2))
+def test_a_port_where_nobody_answers():
+    ends = os.openpty()
+    try:
+        with pytest.raises(
+            RigError, match=r"nobody answers at .* in grbl; is it on"
+        ):
+            Rig.open(RigOptions(port=os.ttyname(ends[1]), answer=0.02, tries=2))
+    finally:
+        for end in ends:
+            os.close(end)
 
 
 def test_a_port_that_does_not_open():
