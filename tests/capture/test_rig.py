@@ -85,9 +85,7 @@ def test_a_port_that_vanishes_is_said():
 def test_a_port_where_nobody_answers():
     ends = os.openpty()
     try:
-        with pytest.raises(
-            RigError, match=r"nobody answers at .* in grbl; is it on"
-        ):
+        with pytest.raises(RigError, match=r"nobody answers at .* in grbl; is it on"):
             Rig.open(RigOptions(port=os.ttyname(ends[1]), answer=0.02, tries=2))
     finally:
         for end in ends:
