@@ -55,6 +55,7 @@ def test_the_fit_keeps_its_bound():
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:.*the texture is stretched")
 @pytest.mark.parametrize("measurement", stability.MEASUREMENTS, ids=lambda m: m.name)
 def test_every_row_is_green(measurement, device):
     """Pictures of 8192 x 8192 pixels among them: about 5 GB."""
