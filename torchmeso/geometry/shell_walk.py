@@ -157,9 +157,8 @@ def leave(through: Tetrahedra, rays: Rays, tet: Int[Tensor, "n"], face: Face) ->
     tip = 6 - face.corner.sum(0)
     vertex = through.tip[4 * tet + tip]
     x, y, t = rays.seen(through.vertices[:, vertex])
-    left = left_of(
-        torch.stack([x, y], -1)[None], torch.stack([face.x, face.y], -1), vertex.expand_as(face.vertex), face.vertex
-    )
+    at_tip, at_rim = torch.stack([x, y], -1), torch.stack([face.x, face.y], -1)
+    left = left_of(at_tip.expand_as(at_rim), at_rim, vertex.expand_as(face.vertex), face.vertex)
     # The ray passes between a corner of the rim and the next, seen from the tip. All on one side: it meets the tip
     # itself, and any way out is as good as another.
     first = left[0] & ~left[1]
