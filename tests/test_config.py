@@ -115,6 +115,8 @@ def test_another_silhouette():
     assert config.with_silhouette(read(minimal()), "paper").render.silhouette == "paper"
 
 
+FEATURE = {"on": "tile", "number": 0, "at": [1, 1], "taken": [0, 0], "size": [0, 4]}
+
 REFUSED = [
     (minimal(camra={}), "unknown key 'camra'; did you mean 'camera'"),
     (minimal(camera={"eye": [0, 0, 1], "fov": 30}), r"unknown key 'camera\.fov'; did you mean 'fov_deg'"),
@@ -154,6 +156,11 @@ REFUSED = [
     (minimal(materials={"clay": {"albedo": [1, 1, 1], "gdm": {}}}), "'gdm' says how to bake a 'meso'"),
     (minimal(materials={"clay": {"albedo": [1, 1, 1], "floor": [1, 1, 1]}}), "'shell' and 'floor' belong to a 'gdm'"),
     (minimal(materials={"clay": {"meso": {"type": "weave"}, "gdm": {}, "shell": {"base": "x"}}}), "got 'x'"),
+    (
+        minimal(objects=[{"mesh": "a.surface", "materials": {"skin": "clay"}}]),
+        "a mesh laid out in quads .* has one 'material'",
+    ),
+    (minimal(materials={"clay": {"wang": {"features": [FEATURE]}}}), "'size': expected at least one row and column"),
 ]
 
 

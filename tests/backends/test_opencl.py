@@ -1,4 +1,6 @@
+import sys
 import warnings
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -139,3 +141,15 @@ def test_a_call_keeps_its_time(device):
 def test_no_room_on_the_device(device):
     with pytest.raises(BackendError, match=r"opencl: no room for a buffer of .* TiB"):
         opencl.allocate(1 << 50)
+
+
+@pytest.mark.errors
+def test_what_is_not_installed_is_said(monkeypatch):
+    find = opencl._pyopencl.__wrapped__
+    package = SimpleNamespace(LogicError=KeyError, get_platforms=lambda: {}["platforms"])
+    monkeypatch.setitem(sys.modules, "pyopencl", package)
+    with pytest.raises(BackendError, match="expected at least one platform, got none"):
+        find()
+    monkeypatch.setitem(sys.modules, "pyopencl", None)
+    with pytest.raises(BackendError, match="pyopencl is not installed"):
+        find()

@@ -2,11 +2,15 @@
 
 import warnings
 from random import Random
+from types import SimpleNamespace
 
 import pytest
+import torch
+import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from torchmeso import config
 from torchmeso.bench import fuzz
 from torchmeso.bench.suite import Context
 from torchmeso.errors import MesoError
@@ -62,3 +66,10 @@ def test_a_hundred_thousand_cases():
     rows = list(fuzz.fuzz(Context()))
     assert sum(row.n for row in rows) == fuzz.CASES
     assert [row.to_json() for row in rows if not row.met] == []
+
+
+@pytest.mark.errors
+def test_pictures_without_values_are_a_strangers(monkeypatch, tmp_path):
+    monkeypatch.setattr(fuzz.frame, "render", lambda *_: SimpleNamespace(rgb=torch.full((2, 2, 3), torch.nan)))
+    with pytest.raises(ArithmeticError, match="not finite"):
+        fuzz._draw(config.parse(yaml.safe_load(fuzz.SHELLED), folder=tmp_path))

@@ -1,4 +1,5 @@
 import math
+import sys
 
 import pytest
 import torch
@@ -101,4 +102,22 @@ def test_corners_of_a_board_are_at_half_pixel_centres():
 def test_pictures_without_a_board_are_refused():
     pytest.importorskip("cv2")
     with pytest.raises(GeometryError, match="no board of 7 x 5"):
+        calibrate.find_corners([torch.zeros(60, 60, dtype=torch.uint8)], 7, 5)
+
+
+@pytest.mark.errors
+def test_what_does_not_fix_a_camera(rng):
+    with pytest.raises(ShapeError, match="at least 4 corners, got 3"):
+        calibrate.calibrate(BOARD[:3], torch.zeros(2, 3, 2), width=640, height=480)
+    few = BOARD[[0, 7, 40, 47] * 4]  # 24 equations for 27 numbers
+    with pytest.raises(GeometryError, match="expected poses that fix the camera"):
+        calibrate.calibrate(few, calibrate.project_board(few, LENS, boards(rng, 3)), width=640, height=480)
+    with pytest.raises(GeometryError, match="at least 3 points, got 2"):
+        calibrate.fit_plane(torch.eye(3)[:2])
+
+
+@pytest.mark.errors
+def test_corners_need_opencv(monkeypatch):
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    with pytest.raises(GeometryError, match=r"expected OpenCV, which is absent; install torchmeso\[rig\]"):
         calibrate.find_corners([torch.zeros(60, 60, dtype=torch.uint8)], 7, 5)

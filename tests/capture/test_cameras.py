@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from torchmeso.capture import cameras
-from torchmeso.capture.cameras import AravisCamera, Camera, FolderCamera, PhotoCamera, VideoCamera
+from torchmeso.capture.cameras import AravisCamera, Camera, FolderCamera, PhotoCamera, VideoCamera, read_frame
 from torchmeso.errors import ConfigError, FormatError, RigError
 
 FRAME = np.arange(24, dtype=np.uint8).reshape(4, 6)
@@ -140,6 +140,9 @@ def test_aravis(monkeypatch):
     camera.device.gives = None
     with pytest.raises(RigError, match="gave no frame of k"):
         camera.expose(0.01, "k")
+    camera.device = None
+    with pytest.raises(RigError, match=r"gave no frame of k \(.*; what was taken stays"):
+        camera.expose(0.01, "k")
     with pytest.raises(RigError, match="Fake_2 does not open"):
         AravisCamera.open("a", "Fake_2")
 
@@ -154,3 +157,9 @@ def test_what_is_not_installed_is_said(monkeypatch):
     monkeypatch.setitem(sys.modules, "cv2", None)
     with pytest.raises(ConfigError, match=r"cv2 is not installed; install opencv-python-headless, in torchmeso\[rig\]"):
         VideoCamera.open("a", 0, (4, 6))
+
+
+@pytest.mark.errors
+def test_a_frame_that_is_not_there(tmp_path):
+    with pytest.raises(FormatError, match=r"none\.png: cannot be read \(No such file"):
+        read_frame(tmp_path / "none.png")

@@ -4,11 +4,12 @@ import os
 import random
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 
-from torchmeso.capture import link, virtual
-from torchmeso.capture.dialects import Pose
+from torchmeso.capture import dialects, link, virtual
+from torchmeso.capture.dialects import Pose, Reply
 from torchmeso.capture.rig import Rig, RigOptions
 from torchmeso.capture.virtual import VirtualOptions
 from torchmeso.errors import ConfigError, RigError
@@ -156,3 +157,43 @@ def test_ten_thousand_commands_over_a_bad_line(dialect):
     begin = time.monotonic()
     assert abused(dialect, 10_000, seed=5) == 2000
     assert time.monotonic() - begin < 3600
+
+
+class Told:
+    """A line whose controller answers and reports as it is told to, and does nothing."""
+
+    def __init__(self, answer="ok", **report):
+        self.answer, self.told, self.port = (
+            answer,
+            Reply(kind="report", text="", **({"still": True} | report)),
+            SimpleNamespace(port="tty"),
+        )
+
+    def say(self, line, seconds):
+        return None if self.answer is None else Reply(kind=self.answer, text="")
+
+    def report(self):
+        return self.told
+
+    def write(self, data):
+        pass
+
+    def pause(self):
+        pass
+
+
+def test_what_a_controller_does_not_do_is_said():
+    def rig(**told):
+        return Rig(RigOptions(port="tty", tries=2, arrive=0.02, settle=0), Told(**told), dialects.dialect("grbl"))
+
+    elsewhere = Pose(5, 5, 5)
+    with pytest.raises(RigError, match=r"expected to get to turntable 1\.000.*is an axis blocked"):
+        rig(pose=elsewhere, laser=0.0).move(Pose(1, 1, 1))
+    with pytest.raises(RigError, match=r"expected the laser at 0, it is at 0\.5; nothing was exposed"):
+        rig(pose=elsewhere, laser=0.5).confirm(elsewhere)
+    with pytest.raises(RigError, match=r"tty does not obey .*; is its cable sound"):
+        rig(pose=elsewhere, laser=0.0).laser(0.7)
+    with pytest.raises(RigError, match="no two reports in a row agree"):
+        rig(pose=elsewhere, still=False).pose()
+    with pytest.raises(RigError, match=r"expected it at turntable 0\.000.* within 0\.02 s, it is not"):
+        rig(pose=elsewhere, laser=0.0).home()

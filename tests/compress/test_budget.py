@@ -129,3 +129,6 @@ def test_what_cannot_be_reached_is_said():
     for size in (lambda s: 9, lambda s: 9 + int(100 / s)):
         with pytest.raises(ConfigError, match=r"5 bytes cannot be reached, (9|20) is the least; give more room"):
             by_step(Budget(size=5), (1.0, 9.0), size=size, **of)
+    hopeful = {"estimate": lambda s: Estimate(-s, 0), "measure": lambda s: -s}
+    with pytest.raises(ConfigError, match="5 bytes cannot be reached, 9 is the least"):
+        by_step(Budget(size=5), (1.0, 9.0), size=lambda s: 9, **hopeful)

@@ -1,3 +1,5 @@
+import sys
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -130,3 +132,10 @@ def test_a_film_that_lost_frames_is_not_kept(tmp_path, monkeypatch):
     with pytest.raises(StorageError, match=r"a\.mp4: could not be written \(of 2 frames 1 are in the film\)"):
         lose()
     assert [p.name for p in tmp_path.iterdir()] == ["a.mp4.part"]  # its pictures wait for another try
+
+
+def test_a_film_needs_opencv(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    with pytest.raises(ConfigError, match=r"MP4: expected OpenCV, found none; pip install 'torchmeso\[video\]'"):
+        record(tmp_path / "walk.mp4")
+    assert not list(tmp_path.iterdir())

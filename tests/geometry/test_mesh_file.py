@@ -28,6 +28,8 @@ def test_refusals(tmp_path):
     face = torch.tensor([[0, 1, 3]])
     with pytest.raises(GeometryError, match="expected vertices 0 to 2 in faces, got 3"):
         MeshFile(vertices=torch.eye(3), faces=face, uv=None, part=torch.zeros(1).long(), groups=(Group("", None),))
+    with pytest.raises(GeometryError, match="expected triangles, got none"):
+        MeshFile(vertices=torch.eye(3), faces=face[:0], uv=None, part=face[:0, 0], groups=(Group("", None),))
     with pytest.raises(ShapeError, match=r"mesh_file\.uv: expected shape \(3, 2\), got \(3, 3\)"):
         MeshFile(
             vertices=torch.eye(3),

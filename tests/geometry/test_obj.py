@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from torchmeso.errors import FormatError, GeometryError
-from torchmeso.geometry import mesh, mesh_file
+from torchmeso.geometry import mesh, mesh_file, obj
 
 TWO_PARTS = """mtllib looks.mtl
 o Body
@@ -105,4 +105,26 @@ def test_corners_are_written_in_many_ways(corners, others, tmp_path):
 def test_what_cannot_be_read(text, kind, message, tmp_path):
     (tmp_path / "a.obj").write_text(text)
     with pytest.raises(kind, match=message):
+        mesh_file.read(tmp_path / "a.obj")
+
+
+@pytest.mark.errors
+def test_polygons_that_are_none_are_refused(tmp_path):
+    path = tmp_path / "a.obj"
+    path.write_text("v 0 0 zero\nf 1 1 1\n")
+    with pytest.raises(FormatError, match=r"a\.obj: expected an OBJ file \("):
+        obj.read_polygons(path)
+    path.write_text("v 0 0 0\nf 1 1 2\n")
+    with pytest.raises(GeometryError, match=r"a\.obj: expected faces of vertices 1 to 1, got others"):
+        obj.read_polygons(path)
+    path.write_text("v 0 0 nan\nf 1 1 1\n")
+    with pytest.raises(GeometryError, match=r"a\.obj: expected finite coordinates, got NaN or infinity"):
+        obj.read_polygons(path)
+
+
+@pytest.mark.errors
+def test_looks_that_are_no_numbers(tmp_path):
+    (tmp_path / "looks.mtl").write_text("newmtl red\nKd red green blue\n")
+    (tmp_path / "a.obj").write_text(TWO_PARTS)
+    with pytest.raises(FormatError, match=r"looks\.mtl: expected numbers for Kd and -bm"):
         mesh_file.read(tmp_path / "a.obj")

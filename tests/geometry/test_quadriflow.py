@@ -1,3 +1,6 @@
+import sys
+from types import ModuleType, SimpleNamespace
+
 import pytest
 import torch
 
@@ -33,3 +36,16 @@ def test_open_meshes_are_refused(ball):
 
     with pytest.raises(GeometryError, match="quadriflow: expected a closed mesh, got 3 edges at borders"):
         quadriflow.quads_of(ball[0], ball[1][1:], 60)
+
+
+@pytest.mark.errors
+def test_a_package_that_is_not_there_or_finds_nothing(ball, monkeypatch):
+    from torchmeso.geometry import quadriflow
+
+    monkeypatch.setitem(sys.modules, "pyQuadriFlow", ModuleType("pyQuadriFlow"))
+    monkeypatch.setitem(sys.modules, "pyQuadriFlow.pyQuadriFlow", SimpleNamespace(pyquadriflow=lambda *_: {}["quads"]))
+    with pytest.raises(GeometryError, match=r"expected about 60 quads, got none \('quads'\); ask for more"):
+        quadriflow.quads_of(*ball, 60)
+    monkeypatch.setitem(sys.modules, "pyQuadriFlow.pyQuadriFlow", None)
+    with pytest.raises(GeometryError, match=r"expected the package pyquadriflow; install the extra: torchmeso\[mesh\]"):
+        quadriflow.quads_of(*ball, 60)

@@ -151,3 +151,9 @@ def test_a_region_without_faces_is_refused():
         scene.read_body(regional(regions=[far]).objects[0])
     with pytest.raises(ConfigError, match="no material is called 'd'"):
         regional(regions=[{**far, "material": "d"}])
+
+
+@pytest.mark.errors
+def test_quads_are_shown_with_their_tiles_only():
+    with pytest.raises(ConfigError, match=r"a\.surface is laid out in tiles, which this cannot show"):
+        scene.read_body(ObjectConfig(mesh="a.surface", material="brick"))

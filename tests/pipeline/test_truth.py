@@ -77,6 +77,14 @@ def test_a_finished_model_has_no_known_geometry(tmp_path):
         truth.geometries(settings)
 
 
+@pytest.mark.errors
+def test_a_mesostructure_laid_out_by_tiles_has_no_known_geometry():
+    tiled = {"meso": {"type": "brick"}, "wang": {}}
+    settings = small(objects=[{"mesh": "a.surface", "material": "brick"}], materials={**CLAY, "brick": tiled})
+    with pytest.raises(ConfigError, match="'brick' is laid out by tiles, its mesostructure by none"):
+        truth.geometries(settings)
+
+
 def test_parts_and_instances_are_told_by_object(tmp_path):
     """A body of two looks at two places: the truth counts objects as the picture does."""
     body = shapes.sphere(radius=0.6, triangles=300)

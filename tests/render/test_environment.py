@@ -12,11 +12,12 @@ from torchmeso.data.eigen_btf import EigenBtf
 from torchmeso.data.sh_btf import ShBtf
 from torchmeso.data.sh_pca_btf import ShPcaBtf
 from torchmeso.data.textured import Textured
-from torchmeso.errors import ConfigError
+from torchmeso.errors import BackendError, ConfigError
 from torchmeso.geometry import frames, hemisphere, shapes
 from torchmeso.geometry.directions import normalize
-from torchmeso.render import environment
+from torchmeso.render import device_environment, environment
 from torchmeso.render import frame as frames_of_torch
+from torchmeso.render.device_tables import Pool
 from torchmeso.render.renderer import Renderer
 from torchmeso.render.scene import Material, Object, Points, Scene, in_double
 
@@ -193,3 +194,16 @@ def test_what_has_no_harmonics_is_refused(rng):
     light = DistantLight(coefficients=torch.ones(1, 3))
     with pytest.raises(ConfigError, match="a Other cannot be lit in the frequency domain"):
         environment.check(Scene(objects=(object_of(Material(btf=Other())),), lights=(), distant=light))
+
+
+@pytest.mark.errors
+def test_what_kernels_have_no_room_for_is_refused(rng, device):
+    body, wide = shapes.sphere(triangles=200), on_device(eigen(rng))
+    clay = Scene(objects=(Object(mesh=body, material=Material()),), lights=(), distant=some_light(rng, 8))
+    with pytest.raises(BackendError, match="distant light up to degree 7, got 8; use the torch backend"):
+        Renderer(clay).render(camera((0.7, 1.1, 2.6)))
+    rank = 65
+    wide = replace(wide, maps=torch.rand(*wide.maps.shape[:3], rank, 3, generator=rng), offset=torch.zeros(rank, 3),
+                   scale=torch.ones(rank, 3), weights=torch.rand(len(VIEWS), rank, generator=rng))  # fmt: skip
+    with pytest.raises(BackendError, match="at most 64 components, got 65; use the torch backend"):
+        device_environment._over_light(Pool(), wide)

@@ -67,3 +67,9 @@ def test_other_suffixes_are_refused(tmp_path, rng):
     with pytest.raises(ConfigError, match=r"expected a name that ends in \.png or \.exr"):
         film.write(picture(rng), tmp_path / "a.tiff")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.errors
+def test_no_pictures_have_no_sum():
+    with pytest.raises(ConfigError, match="expected at least one picture, got none"):
+        film.total([])

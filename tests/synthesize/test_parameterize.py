@@ -69,6 +69,9 @@ def test_bad_meshes_are_one_sentence(box, ball, tmp_path):
         of_file(tmp_path / "a.off", SurfaceOptions(by="quads"))
     with pytest.raises(GeometryError, match=r"box.obj: expected three texture coordinates at each corner"):
         of_file(box, SurfaceOptions(by="polycube"))
+    cube = write(tmp_path / "cube.obj", CORNERS, CUBE.tolist(), [[1, 1, 1], *CORNERS[1:]])
+    with pytest.raises(GeometryError, match="expected triangles in a PolyCube map, got faces of other corners"):
+        of_file(cube, SurfaceOptions(by="polycube"))
     with pytest.raises(FormatError, match=r"none.obj: expected a mesh file, found none"):
         of_file(tmp_path / "none.obj", SurfaceOptions())
     with pytest.raises(ConfigError, match=r"surface.by: expected a way to quads, got 'cubes'; did you mean 'cube'"):
