@@ -1,7 +1,7 @@
 """Lists every `raise` of the package that no test reaches: `pytest -p raise_coverage`.
 
 A plugin, not a test: it follows every call, so that a run takes longer. Code that runs in processes of its own, as
-the command line does in some tests, is not seen; nor is what is raised where the stack is full, as following ends there.
+the command line does in some tests, is not seen; nor is what is raised where the stack is full: following ends there.
 
 Test: tests/test_raise_coverage.py
 """

@@ -1,10 +1,12 @@
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
 from torchmeso.data.environment import LUMINANCE, Environment, Texels
 from torchmeso.errors import ConfigError
+from torchmeso.pipeline.environment import about
 from torchmeso.transport import light_sampling
 from torchmeso.transport.light_sampling import directions, from_quads, to_quads
 
@@ -100,6 +102,19 @@ def test_a_small_turn_of_the_map_changes_the_picture_little(rng):
         exact.append(diffuse((t.directions, t.solid_angle[:, None] * t.radiance), normals))
     steps, wanted = (torch.stack(x).diff(dim=0).square().mean().sqrt() for x in (pictures, exact))
     assert float(steps / wanted) < 1.1  # measured 1.036
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_lights_turn_with_their_map(method, rng):
+    made = some_map(rng)
+    R = about((1.0, 2.0, 0.5), 77.0).float()
+    before = light_sampling.lights(made, 50, method=method)
+    after = light_sampling.lights(replace(made, rotation=R @ made.rotation), 50, method=method)
+    for a, b in zip(before, after, strict=True):
+        torch.testing.assert_close(b.direction, R @ a.direction)
+        assert torch.equal(a.irradiance, b.irradiance)
+    total = sum(b.irradiance.double() for b in after)
+    torch.testing.assert_close(total, replace(made, rotation=R).irradiance(), rtol=1e-6, atol=0)
 
 
 def test_joining_keeps_luminance_and_its_centre(rng):

@@ -3,9 +3,10 @@
 `quadtree` follows the Spherical Q2-tree as leung2007tileable, section 4.2, and the abstract of wan2005spherical
 describe it: the sphere is cut by curvilinear equations into twelve quadrilaterals of equal area, which are halved at
 the middle again and again, all quads of a level as large as each other (gorski2005healpix). The quad that is most
-important, its luminance times the square root of its solid angle, is halved next, until there are twice as many as
-lights; then neighbours are joined, because fixed cuts go through what belongs together. Sums over quads are made once
-for all levels. The tree stands still while the light turns: what changes in one place leaves the cuts elsewhere alone.
+important, its luminance times the fourth root of its solid angle (agarwal2003structured, section 3), is halved next,
+until there are twice as many as lights; then neighbours are joined, because fixed cuts go through what belongs
+together. Sums over quads are made once for all levels. What changes in one place leaves the cuts elsewhere alone.
+Regions belong to the map, not to the world: a map that turns takes its lights with it, and they do not flicker.
 
 `median_cut` (debevec2005mediancut) halves the light of rectangles of a lat-long map; `uniform` gives each texel to the
 nearest of evenly spread directions. In all of them a light carries all the light of its region, so their sum is the
@@ -16,6 +17,7 @@ Test: tests/transport/test_light_sampling.py
 
 import heapq
 import math
+from dataclasses import replace
 from typing import Literal
 
 import torch
@@ -44,12 +46,14 @@ BASE = 12
 def lights(environment: Environment, count: int, *, method: Method = "quadtree") -> tuple[DirectionalLight, ...]:
     """Return at most `count` lights whose irradiances sum up to the environment's.
 
-    There are fewer where fewer texels shine; none of a black map.
+    There are fewer where fewer texels shine; none of a black map. They turn as the environment does.
 
     Raises:
         ConfigError: count is not in 1..100,000.
     """
-    direction, irradiance = directions(environment.texels(), count, method=method)
+    unturned = replace(environment, rotation=torch.eye(3))
+    direction, irradiance = directions(unturned.texels(), count, method=method)
+    direction = direction @ environment.rotation.double().mT
     return tuple(
         DirectionalLight(direction=w, irradiance=E)
         for w, E in zip(direction.float().unbind(0), irradiance.float().unbind(0), strict=True)
@@ -99,7 +103,7 @@ def _quadtree(w: Tensor, energy: Tensor, count: int) -> tuple[Tensor, Tensor]:
         light = luminance[level][cell]
         if light > 0:
             last = level == len(levels) - 1
-            heapq.heappush(heap, (0.0 if last else -light * 2 ** (-level / 2), level, cell))
+            heapq.heappush(heap, (0.0 if last else -light * 2 ** (-level / 4), level, cell))
 
     for quad in range(BASE):
         push(0, quad)
@@ -120,16 +124,17 @@ def _quadtree(w: Tensor, energy: Tensor, count: int) -> tuple[Tensor, Tensor]:
 
 
 def _joined(moments: Float[Tensor, "n 7"], w: Float[Tensor, "n 3"], count: int) -> tuple[Tensor, Tensor]:
-    """Return lights of `count` regions: again and again the two are joined whose light has the shortest way to go.
+    """Return lights of `count` regions: again and again the two are joined whose light suffers least from it.
 
-    The way is that of both to their common centre, weighted by luminance: L1 L2 / (L1 + L2) |w1 - w2|.
+    That is L1 L2 / (L1 + L2) |w1 - w2|^(1/2): the light that moves, times how much a picture changes by it. Shadows'
+    edges change it by the way, what is smooth by its square; averaged over a knot's points the root fits best.
     """
     moments, w = moments.clone(), w.clone()
     alive = torch.ones(len(w), dtype=torch.bool)
 
     def ways(i: int) -> Tensor:
         L = moments[:, 3]
-        way = (w - w[i]).norm(dim=1) * L * L[i] / (L + L[i])
+        way = (w - w[i]).norm(dim=1).sqrt() * L * L[i] / (L + L[i])
         return way.masked_fill(~alive, math.inf).index_fill(0, torch.tensor([i]), math.inf)
 
     if len(w) <= count:
