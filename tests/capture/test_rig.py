@@ -182,6 +182,7 @@ class Told:
         pass
 
 
+@pytest.mark.errors
 def test_what_a_controller_does_not_do_is_said():
     def rig(**told):
         return Rig(RigOptions(port="tty", tries=2, arrive=0.02, settle=0), Told(**told), dialects.dialect("grbl"))

@@ -3,7 +3,7 @@
 Test: tests/bench/test_light.py
 """
 
-from torchmeso.bench import light_error, light_speed
+from torchmeso.bench import light_error, light_pick, light_speed
 from torchmeso.bench.suite import Measurement
 
 MEASUREMENTS = [
@@ -12,5 +12,6 @@ MEASUREMENTS = [
     Measurement("energy", light_error.energy),
     Measurement("bands", light_error.bands),
     Measurement("transfer", light_error.through_transfer),
+    Measurement("pick", light_pick.methods),
     Measurement("frame", light_speed.frames_under_environments),
 ]

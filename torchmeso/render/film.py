@@ -24,7 +24,7 @@ class Picture:
         rgb: (H, W, 3) linear radiance.
         depth: (H, W) distance along the pixel's ray to what is seen; inf where nothing is.
         owner: (H, W) object seen; -1 = background, -2 = the inside of an object the eye is in.
-        shadowed: (light, H, W) whether a light is blocked at what is seen.
+        shadowed: (light, H, W) whether a light is blocked at what is seen; nowhere for a light that was left out.
         counts: what was done and what was skipped, by name.
         seconds: wall time per stage, by name.
     """

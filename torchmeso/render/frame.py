@@ -42,7 +42,7 @@ class Skips:
         losers: only what is seen is shaded.
         facing: points that lean away from all lights ask a screen for neither depth nor shadow.
         resting: shadow maps stay while light and objects do, and triangles on the screen while the camera does.
-        unlit: lights that reach no object are left out.
+        unlit: lights that reach no object, or stand under the horizon of every vertex, are left out.
         carried: what a look-up in a shell told of the way ahead, that it is empty or where it ends, is not asked again
             in the next prisms while the way through them turns little. Beside rank errors the one that may change a
             picture: of a weave of 64 voxels a pixel in a hundred ends more than a voxel from where it did, no further

@@ -22,8 +22,8 @@ from torchmeso.backends import opencl
 from torchmeso.data import image
 from torchmeso.errors import BackendError, check_memory
 from torchmeso.geometry.camera import Camera
-from torchmeso.geometry.light import DirectionalLight, Light, SpotLight
-from torchmeso.render import device, film, shadow_map
+from torchmeso.geometry.light import Light
+from torchmeso.render import device, film, reach, shadow_map
 from torchmeso.render.device_picture import DETAILS, DISPLAY, MOST_STARTS, DevicePicture, named
 from torchmeso.render.device_raster import ROOM, STAMPS, DeviceViews
 from torchmeso.render.device_scene import are, depths, upload_scene
@@ -160,8 +160,10 @@ class Renderer:
         world = self._on_device.world
         given = lights = world.lit_by(self._on_device.scene.lights if lights is None else lights)
         camera = world.seen_by(camera)
-        reaching = [i for i, light in enumerate(lights) if not self._skips.unlit or self._reaches(light)]
-        lights = tuple(lights[i] for i in reaching) if len(reaching) < len(lights) else lights
+        reached = list(range(len(lights)))
+        if self._skips.unlit:
+            reached = reach.reaching(lights, self._on_device.scene, self._on_device.geometry.mesh.balls)
+        lights = tuple(lights[i] for i in reached) if len(reached) < len(lights) else lights
         check_memory("render", camera.width * camera.height * 100.0, MEMORY_LIMIT, "render fewer pixels")
         while True:
             maps, picture = self._room(camera, lights)
@@ -180,10 +182,10 @@ class Renderer:
             if self._fits(counts + (maps.views.counts() if drawn and maps else [])):
                 break
         opencl.read(picture.results[:1] if outputs == DISPLAY else picture.results[1:])
-        picture.lit = (len(given), reaching)
+        picture.lit = (len(given), reached)
         faces = sum(maps.faces) if maps else 0
         self.counts = named(counts[0], camera) | {
-            "lights left out": len(given) - len(reaching),
+            "lights left out": len(given) - len(reached),
             "shadow maps drawn": faces if drawn else 0,
             "shadow maps kept": 0 if drawn else faces,
             "shadow stamps left out": maps.views.total("stamps") - maps.views.total("asked") if maps else 0,
@@ -193,21 +195,6 @@ class Renderer:
         }
         self._uploaded = dict.fromkeys(self._uploaded, 0)
         return picture
-
-    def _reaches(self, light: Light) -> bool:
-        """Return whether any light falls on any object; in doubt it does."""
-        power = light.irradiance if isinstance(light, DirectionalLight) else light.intensity
-        if max(power.tolist()) <= 0:
-            return False
-        if not isinstance(light, SpotLight):
-            return True
-        balls = self._on_device.geometry.mesh.balls
-        centre, radius = balls[:, :3], balls[:, 3]
-        way = centre - light.position.double().numpy()
-        distance = np.maximum(np.linalg.norm(way, axis=-1), 1e-30)
-        off_axis = np.arccos(np.clip(way @ light.axis.double().numpy() / distance, -1, 1))
-        seen_under = np.arcsin(np.minimum(radius / distance, 1))
-        return bool((off_axis <= np.radians(light.outer_deg) + seen_under + 1e-6).any())
 
     def milliseconds(self) -> dict[str, float]:
         """Return the time of each kernel in the last frame; of the shadow maps' where they were last drawn."""
